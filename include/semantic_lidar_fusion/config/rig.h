@@ -1,0 +1,136 @@
+// SPDX-License-Identifier: MIT
+/// The rig file: one YAML for a vehicle or data set, shared by all nodelets and tools.
+///
+/// Loading checks everything and reports every problem at once, each with key, value and rule;
+/// unknown keys are errors (with the nearest known key). Relative paths are relative to the rig
+/// file. The keys are documented in config/usyd.yaml; a key's name equals the field's.
+#pragma once
+
+#include <cstdint>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "semantic_lidar_fusion/common/label_set.h"
+#include "semantic_lidar_fusion/fusion/camera_merger.h"
+#include "semantic_lidar_fusion/lidar/packet.h"
+#include "semantic_lidar_fusion/motion/compensation.h"
+#include "semantic_lidar_fusion/projection/occlusion_mask.h"
+#include "semantic_lidar_fusion/superpixel/uncertainty.h"
+#include "semantic_lidar_fusion/sync/scan_selector.h"
+
+namespace YAML {
+class Node;
+}
+
+namespace semantic_lidar_fusion {
+
+enum class ImageTransport : std::uint8_t { kRaw, kCompressed };
+enum class CameraInput : std::uint8_t { kScores, kLabels, kProbabilities };
+
+struct CameraConfig {
+  std::string name;  ///< [A-Za-z][A-Za-z0-9_]*; output topics live in /<name>/
+  std::string ns;    ///< key `namespace`: topics of the camera, e.g. /gmsl/A0; default: name
+  std::string image = "image";  ///< topic below `namespace`
+  std::string camera_info = "camera_info";
+  std::string scores = "scores";  ///< or labels / probabilities, after `input`
+  ImageTransport transport = ImageTransport::kRaw;
+  bool rectified = false;
+  CameraInput input = CameraInput::kScores;
+  std::string mask;          ///< path of an 8-bit image, 0 = never transfer; empty = none
+  ScoreFormat score_format;  ///< keys score_scale, score_offset
+  double max_theta_deg = 0.0;
+  double time_offset_s = 0.0;           ///< key time_offset
+  double max_time_difference_s = 0.05;  ///< key max_time_difference
+  double timeout_s = 0.2;               ///< key timeout
+};
+
+enum class LidarInput : std::uint8_t { kPackets, kPoints };
+enum class TimeUnit : std::uint8_t { kAuto, kSeconds, kMilliseconds, kMicroseconds, kNanoseconds };
+enum class TimeReference : std::uint8_t { kAuto, kStamp, kAbsolute, kScanEnd };
+enum class WithoutTime : std::uint8_t { kReject, kInstant, kAzimuth };
+
+struct LidarConfig {
+  LidarInput input = LidarInput::kPackets;
+  std::string topic;                ///< default: velodyne_packets or points, after `input`
+  std::optional<LidarModel> model;  ///< key `model: auto|VLP16|PuckHiRes|VLP32C|HDL32E`
+  std::string frame;                ///< overrides the messages' frame; empty = theirs
+  double min_range_m = 0.0;         ///< 0 = no limit
+  double max_range_m = 0.0;
+  std::string time_field;  ///< empty = detect
+  TimeUnit time_unit = TimeUnit::kAuto;
+  TimeReference time_reference = TimeReference::kAuto;
+  WithoutTime without_time = WithoutTime::kInstant;
+  PacketStamp packet_stamp = PacketStamp::kStart;
+  double time_offset_s = 0.0;              ///< key time_offset
+  std::vector<double> vertical_offsets_m;  ///< per ring, lowest first; empty = none
+};
+
+enum class OdometrySource : std::uint8_t { kTf, kTopic };
+
+struct OdometryConfig {
+  OdometrySource source = OdometrySource::kTf;
+  std::string topic = "odom";  ///< nav_msgs/Odometry, for `source: topic`
+  double time_offset_s = 0.0;  ///< key time_offset
+  OdometryLookup lookup = OdometryLookup::kInterpolate;
+  OnMissingOdometry on_missing = OnMissingOdometry::kMark;
+  double max_extrapolation_s = 0.1;  ///< key max_extrapolation
+  double timeout_s = 0.1;            ///< key timeout
+};
+
+struct ReferenceConfig {
+  ReferenceChoice choose = ReferenceChoice::kClosestImage;
+  std::string camera;      ///< default: the first camera
+  double timeout_s = 0.2;  ///< key timeout
+};
+
+struct SuperpixelConfig {
+  int count = 1000;
+  double compactness = 10.0;
+  int iterations = 10;
+  double scale = 0.0;  ///< of the image; 0 (absent) = the size of the scores
+  bool warm_start = true;
+};
+
+enum class SegmentationMode : std::uint8_t { kOnRequest, kFreeRunning };
+
+struct SegmentationConfig {
+  std::string model;  ///< path of a model file (see segmentation/model.h); empty = none
+  SegmentationMode mode = SegmentationMode::kOnRequest;
+};
+
+struct Rig {
+  std::string name;
+  LabelSet classes;                   ///< key `classes`: {file: PATH} or a class set in place
+  std::vector<CameraConfig> cameras;  ///< at most 16; the position is the bit in `cameras`
+  LidarConfig lidar;
+  std::string fixed_frame = "odom";
+  std::string vehicle_frame = "base_link";
+  SuperpixelConfig superpixels;
+  UncertaintyConfig uncertainty;
+  bool motion_enabled = true;                                         ///< key motion.enabled
+  MotionGranularity motion_granularity = MotionGranularity::kFiring;  ///< key motion.granularity
+  OdometryConfig odometry;
+  ReferenceConfig reference;
+  ImageChoice image_choice = ImageChoice::kClosestToReference;
+  SegmentationConfig segmentation;
+  OcclusionConfig occlusion;
+  OverlapRule overlap = OverlapRule::kMean;
+  bool keep_unlabelled = true;
+
+  /// Index of the reference camera; -1 without cameras.
+  int referenceCamera() const;
+  SelectorConfig selectorConfig() const;
+  CompensationConfig compensationConfig() const;
+};
+
+/// Loads and checks. `overrides`: "key=value", keys with dots ("occlusion.mode=paper"), cameras by
+/// name
+/// ("cameras.A0.max_theta_deg=50"), values in YAML; applied before checking. Throws ConfigError
+/// with every problem.
+Rig loadRig(const std::string& path, const std::vector<std::string>& overrides = {});
+/// The same for a tree that is already in memory; relative paths are relative to `base_directory`.
+Rig rigFromYaml(const YAML::Node& root, const std::string& base_directory,
+                const std::string& source_name, const std::vector<std::string>& overrides = {});
+
+}  // namespace semantic_lidar_fusion

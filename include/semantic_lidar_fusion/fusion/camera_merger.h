@@ -1,0 +1,33 @@
+// SPDX-License-Identifier: MIT
+/// Merges what several cameras say of the same point; the result does not depend on their order.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "semantic_lidar_fusion/common/point_cloud.h"
+
+namespace semantic_lidar_fusion {
+
+enum class OverlapRule : std::uint8_t {
+  kMean,           ///< arithmetic mean of the distributions
+  kProduct,        ///< normalised product; independent evidence
+  kNearestInTime,  ///< smallest |t_point - t_image|, ties averaged
+  kMostCentral,    ///< smallest angle from the optical axis, ties averaged
+};
+
+/// One camera's distributions of its visible points.
+struct CameraVotes {
+  int rig_index = 0;
+  std::vector<std::uint32_t> index;              ///< into the cloud, ascending
+  std::vector<double> probabilities;             ///< index.size() x class_count, row-major
+  std::vector<std::int64_t> time_difference_ns;  ///< |t_point - t_image|
+  std::vector<float> theta;                      ///< rad
+};
+
+/// Fills label, confidence, entropy, cameras and probabilities of the points that have votes, and
+/// sets their status to kFused; the others keep their status and get the values of "none". `votes`
+/// are in order of camera name.
+void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, SemanticCloud* cloud);
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: MIT
+/// Ego-motion compensation of a lidar scan (paper, eq. 5), in double precision through the fixed
+/// frame, cast to float last:
+///   T_lidar(t_ref)_lidar(t_i) = T_lidar_vehicle * T_vehicle_fixed(t_ref) * T_fixed_vehicle(t_i) *
+///                               T_vehicle_lidar.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <optional>
+
+#include "semantic_lidar_fusion/common/point_cloud.h"
+#include "semantic_lidar_fusion/motion/pose_buffer.h"
+
+namespace semantic_lidar_fusion {
+
+enum class MotionGranularity : std::uint8_t {
+  kFiring,  ///< a pose for each firing, continuous within it
+  kPacket,  ///< the pose of the packet's first firing (the paper's)
+};
+enum class OdometryLookup : std::uint8_t {
+  kInterpolate,
+  kClosest,  ///< the reading closest to the point's time (the paper's); t_ref is always
+             ///< interpolated
+};
+/// What happens to firings that odometry does not cover.
+enum class OnMissingOdometry : std::uint8_t {
+  kMark,         ///< stay as measured, status kNoOdometry
+  kDrop,         ///< do not come out
+  kHold,         ///< the nearest reading's pose
+  kExtrapolate,  ///< constant twist of the nearest two readings, up to max_extrapolation; marked
+                 ///< beyond
+};
+
+struct CompensationConfig {
+  bool enabled = true;  ///< false: points stay as measured, none is marked
+  MotionGranularity granularity = MotionGranularity::kFiring;
+  OdometryLookup lookup = OdometryLookup::kInterpolate;
+  OnMissingOdometry on_missing = OnMissingOdometry::kMark;
+  StampNs max_extrapolation_ns = 100000000;
+};
+
+struct CompensationCounters {
+  std::size_t marked_points = 0;
+  std::size_t dropped_points = 0;
+  std::size_t held_points = 0;
+  std::size_t extrapolated_points = 0;
+  std::size_t uncovered_firings = 0;
+  bool reference_covered = true;  ///< false: odometry does not cover t_ref; every point is marked
+};
+
+struct CompensationResult {
+  Cloud cloud;
+  CompensationCounters counters;
+};
+
+/// All points of `scan` as seen from the lidar's pose at `reference_ns` (true time). The order of
+/// points is kept.
+CompensationResult compensate(const TimedCloud& scan, StampNs reference_ns,
+                              const PoseBuffer& odometry, const Transform& T_vehicle_lidar,
+                              const CompensationConfig& config);
+
+/// Vehicle motion between two times, T_vehicle(to)_vehicle(from); empty if odometry does not cover
+/// both.
+std::optional<Transform> vehicleMotion(const PoseBuffer& odometry, StampNs from_ns, StampNs to_ns);
+
+}  // namespace semantic_lidar_fusion
