@@ -28,9 +28,8 @@ class RayScene {
 
   /// Horizontal plane.
   int addGround(double z) {
-    return add([z](const Eigen::Vector3d& o, const Eigen::Vector3d& d) {
-      return (z - o.z()) / d.z();
-    });
+    return add(
+        [z](const Eigen::Vector3d& o, const Eigen::Vector3d& d) { return (z - o.z()) / d.z(); });
   }
 
   /// Parallelogram corner + a * edge_a + b * edge_b, a and b in 0..1.
@@ -181,13 +180,13 @@ inline LidarScan scanScene(const RayScene& scene, const Transform& T_world_lidar
     for (std::size_t ring = 0; ring < pattern.elevation_deg.size(); ++ring) {
       // Clockwise, as the sensor turns.
       const double azimuth =
-          radians(pattern.azimuth_end_deg - (column + pattern.laser_shift * ring + 0.37) *
-                                                pattern.azimuth_step_deg);
+          radians(pattern.azimuth_end_deg -
+                  (column + pattern.laser_shift * ring + 0.37) * pattern.azimuth_step_deg);
       const double elevation = radians(pattern.elevation_deg[ring]);
       const Eigen::Vector3d beam(std::cos(elevation) * std::cos(azimuth),
                                  std::cos(elevation) * std::sin(azimuth), std::sin(elevation));
-      const RayScene::Hit hit = scene.cast(T_world_lidar.translation(),
-                                           T_world_lidar.linear() * beam);
+      const RayScene::Hit hit =
+          scene.cast(T_world_lidar.translation(), T_world_lidar.linear() * beam);
       const double error = noise(random);
       if (!(hit.distance < pattern.max_range_m) || unit(random) < pattern.dropout) continue;
       const Eigen::Vector3f p = ((hit.distance + error) * beam).cast<float>();
