@@ -4,6 +4,4 @@
 from catkin_pkg.python_setup import generate_distutils_setup
 from setuptools import setup
 
-setup(
-    **generate_distutils_setup(packages=["semantic_lidar_fusion"], package_dir={"": "scripts"})
-)
+setup(**generate_distutils_setup(packages=["semantic_lidar_fusion"], package_dir={"": "scripts"}))

@@ -20,6 +20,12 @@ fail() {
   echo "test.sh: $*" >&2
   exit 2
 }
+# A failure before any test ran ends with the same last line.
+broken() {
+  echo "test.sh: $*" >&2
+  echo "0 passed, 1 failed"
+  exit 1
+}
 needs_value() { [ $# -ge 2 ] && [ -n "$2" ] || fail "$1 needs a value"; }
 
 build_dir="" filter="" sanitize="" install=1 install_only=0
@@ -48,7 +54,7 @@ mkdir -p "$build_dir"
 build_dir=$(cd "$build_dir" && pwd)
 
 if [ "$install" = 1 ]; then
-  bash "$source_dir/scripts/install_dependencies.sh"
+  bash "$source_dir/scripts/install_dependencies.sh" || broken "the dependencies are not installed"
 fi
 [ "$install_only" = 0 ] || exit 0
 
@@ -84,9 +90,9 @@ esac
 cd "$build_dir"
 cmake "$source_dir" -DCMAKE_BUILD_TYPE=Release -DSLF_WERROR=ON -DSLF_SANITIZE="$sanitize" \
   -DPYTHON_EXECUTABLE=/usr/bin/python3 -DPython3_EXECUTABLE=/usr/bin/python3 \
-  -DCMAKE_INSTALL_PREFIX="$build_dir/install" -DCATKIN_ENABLE_TESTING=ON
-cmake --build . -- -j"$jobs"
-cmake --build . --target tests -- -j"$jobs"
+  -DCMAKE_INSTALL_PREFIX="$build_dir/install" -DCATKIN_ENABLE_TESTING=ON || broken "the configuration failed"
+cmake --build . -- -j"$jobs" || broken "the build failed"
+cmake --build . --target tests -- -j"$jobs" || broken "the build of the tests failed"
 
 rm -rf test_results ros_home Testing
 ctest --output-on-failure -j"$jobs" ${filter:+-R "$filter"} </dev/null || true

@@ -195,10 +195,13 @@ Plan makePlan(const TimedCloud& scan, const PoseBuffer& odometry, bool reference
   if (by_packet) plan.packet_times = packetTimes(scan);
   plan.fates.assign(scan.firings.size(), Fate::kMove);
   plan.uncovered.assign(scan.firings.size(), false);
+  const auto& readings = odometry.readings();
+  const StampNs covered_from = readings.empty() ? 1 : readings.front().stamp;
+  const StampNs covered_to = readings.empty() ? 0 : readings.back().stamp;
   for (std::size_t k = 0; k < scan.firings.size(); ++k) {
     const StampNs begin = by_packet ? plan.packet_times[k] : scan.firings[k].begin_ns;
     const StampNs end = scan.firings[k].end_ns;
-    if (!odometry.covers(begin) || !odometry.covers(end)) {
+    if (begin < covered_from || end > covered_to) {
       plan.uncovered[k] = true;
       ++plan.uncovered_count;
       plan.fates[k] = fateOfUncovered(begin, end, odometry, config);
@@ -290,30 +293,44 @@ Track makeTrack(const PoseBuffer& odometry, const Transform& T_fixed_vehicle_ref
   return track;
 }
 
-/// Moves points [begin, end), whose poses lie in `segment`; `pose_time` is null for each point's
-/// own time.
+/// The arrays are all distinct; the compiler must know it to use vector instructions.
+void transform(const Segment& segment, std::size_t count, const float* __restrict ns,
+               const float* __restrict x, const float* __restrict y, const float* __restrict z,
+               float* __restrict out_x, float* __restrict out_y, float* __restrict out_z) {
+  const auto& a = segment.start;
+  const auto& r = segment.rate_per_ns;
+  for (std::size_t i = 0; i < count; ++i) {
+    out_x[i] = a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3] +
+               ns[i] * (r[0] * x[i] + r[1] * y[i] + r[2] * z[i] + r[3]);
+    out_y[i] = a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7] +
+               ns[i] * (r[4] * x[i] + r[5] * y[i] + r[6] * z[i] + r[7]);
+    out_z[i] = a[8] * x[i] + a[9] * y[i] + a[10] * z[i] + a[11] +
+               ns[i] * (r[8] * x[i] + r[9] * y[i] + r[10] * z[i] + r[11]);
+  }
+}
+
+/// Moves points [begin, end), whose poses lie in `segment`, each at its own time or all at
+/// `*pose_time`.
 void move(const TimedCloud& scan, std::size_t begin, std::size_t end, const Segment& segment,
           const StampNs* pose_time, Cloud& cloud) {
-  const float* const a = segment.start;
-  const float* const r = segment.rate_per_ns;
-  const StampNs* const time = scan.time_ns.data();
-  const StampNs origin = segment.begin_ns;
-  const float fixed_ns = pose_time ? static_cast<float>(*pose_time - origin) : 0.0f;
-  const float* const x = scan.x.data();
-  const float* const y = scan.y.data();
-  const float* const z = scan.z.data();
-  float* const out_x = cloud.x.data();
-  float* const out_y = cloud.y.data();
-  float* const out_z = cloud.z.data();
-  for (std::size_t i = begin; i < end; ++i) {
-    const float ns =
-        pose_time ? fixed_ns : static_cast<float>(static_cast<std::int32_t>(time[i] - origin));
-    out_x[i] = a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3] +
-               ns * (r[0] * x[i] + r[1] * y[i] + r[2] * z[i] + r[3]);
-    out_y[i] = a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7] +
-               ns * (r[4] * x[i] + r[5] * y[i] + r[6] * z[i] + r[7]);
-    out_z[i] = a[8] * x[i] + a[9] * y[i] + a[10] * z[i] + a[11] +
-               ns * (r[8] * x[i] + r[9] * y[i] + r[10] * z[i] + r[11]);
+  Segment s = segment;
+  if (pose_time) {
+    const float ns = static_cast<float>(*pose_time - s.begin_ns);
+    for (int k = 0; k < 12; ++k) {
+      s.start[k] += ns * s.rate_per_ns[k];
+      s.rate_per_ns[k] = 0.0f;
+    }
+  }
+  // Times first, then coordinates: 64-bit integers keep compilers from using vector instructions.
+  constexpr std::size_t kBlock = 256;
+  float ns[kBlock];
+  for (; begin < end; begin += kBlock) {
+    const std::size_t count = std::min(kBlock, end - begin);
+    for (std::size_t i = 0; i < count; ++i) {
+      ns[i] = static_cast<float>(static_cast<std::int32_t>(scan.time_ns[begin + i] - s.begin_ns));
+    }
+    transform(s, count, ns, scan.x.data() + begin, scan.y.data() + begin, scan.z.data() + begin,
+              cloud.x.data() + begin, cloud.y.data() + begin, cloud.z.data() + begin);
   }
 }
 
@@ -374,21 +391,36 @@ void removeDropped(const TimedCloud& scan, const std::vector<Fate>& fates, Cloud
   cloud.resize(kept);
 }
 
+/// time - reference in s.
+void secondsSince(StampNs reference_ns, const std::vector<StampNs>& times, const ScanInterval& span,
+                  std::vector<float>& seconds) {
+  seconds.resize(times.size());
+  constexpr StampNs kNear = std::numeric_limits<std::int32_t>::max();
+  if (span.first_ns >= reference_ns - kNear && span.last_ns <= reference_ns + kNear) {
+    // 32-bit integers convert by vector instructions.
+    for (std::size_t i = 0; i < times.size(); ++i) {
+      seconds[i] = static_cast<float>(1e-9 * static_cast<std::int32_t>(times[i] - reference_ns));
+    }
+  } else {
+    for (std::size_t i = 0; i < times.size(); ++i) {
+      seconds[i] = static_cast<float>(toSeconds(times[i] - reference_ns));
+    }
+  }
+}
+
 Cloud asMeasured(const TimedCloud& scan, StampNs reference_ns) {
+  const ScanInterval span = scanInterval(scan);
   Cloud cloud;
   cloud.frame_id = scan.frame_id;
   cloud.stamp = scan.empty() ? scan.header_stamp : reference_ns;
-  cloud.first_point_ns = scanInterval(scan).first_ns;
+  cloud.first_point_ns = span.first_ns;
   cloud.x = scan.x;
   cloud.y = scan.y;
   cloud.z = scan.z;
   cloud.intensity = scan.intensity;
   cloud.ring = scan.ring;
   cloud.status.assign(scan.size(), static_cast<std::uint8_t>(PointStatus::kFused));
-  cloud.dt.resize(scan.size());
-  for (std::size_t i = 0; i < scan.size(); ++i) {
-    cloud.dt[i] = static_cast<float>(toSeconds(scan.time_ns[i] - reference_ns));
-  }
+  secondsSince(reference_ns, scan.time_ns, span, cloud.dt);
   return cloud;
 }
 

@@ -51,7 +51,9 @@ def main(argv):
         suite, "testcase", classname="shell", name=name, time="%.3f" % (time.monotonic() - start)
     )
     if failed:
-        failure = ET.SubElement(case, "failure", message="exit code %d: %s" % (done.returncode, last))
+        failure = ET.SubElement(
+            case, "failure", message="exit code %d: %s" % (done.returncode, last)
+        )
         failure.text = output[-4000:]
     elif skipped:
         ET.SubElement(case, "skipped", message=last)
