@@ -50,8 +50,6 @@ void BagOutput::commit() {
   committed_ = true;
 }
 
-void BagOutput::fail(const std::string& why) {
-  throw Error(path_ + ": cannot be written: " + why);
-}
+void BagOutput::fail(const std::string& why) { throw Error(path_ + ": cannot be written: " + why); }
 
 }  // namespace semantic_lidar_fusion

@@ -49,9 +49,8 @@ void addByStamp(const rosbag::MessageInstance& message, const std::string& what,
   if (stamp == 0) {
     drops->count(what + ": stamp 0", message.getTopic() + ": message with stamp 0 is dropped");
   } else if (!messages->emplace(stamp, message).second) {
-    drops->count(what + ": stamp seen twice",
-                 message.getTopic() + ": second message of stamp " + std::to_string(stamp) +
-                     " ns is dropped");
+    drops->count(what + ": stamp seen twice", message.getTopic() + ": second message of stamp " +
+                                                  std::to_string(stamp) + " ns is dropped");
   }
 }
 
@@ -97,11 +96,11 @@ class Router {
     const std::string name = "camera " + camera.name;
     std::string problem;
 
-    const std::string image = findTopic(input_, imageTopic(camera),
-                                        camera.transport == ImageTransport::kCompressed
-                                            ? "sensor_msgs/CompressedImage"
-                                            : "sensor_msgs/Image",
-                                        name, &problem);
+    const std::string image =
+        findTopic(input_, imageTopic(camera),
+                  camera.transport == ImageTransport::kCompressed ? "sensor_msgs/CompressedImage"
+                                                                  : "sensor_msgs/Image",
+                  name, &problem);
     track->has_images = !image.empty();
     if (track->has_images) {
       handlers_[image].push_back([=](const rosbag::MessageInstance& m) {
@@ -111,8 +110,8 @@ class Router {
       DropLog::warn(problem);
     }
 
-    const std::string semantics = findTopic(input_, inputTopic(camera, camera.scores),
-                                            "sensor_msgs/Image", name, &problem);
+    const std::string semantics =
+        findTopic(input_, inputTopic(camera, camera.scores), "sensor_msgs/Image", name, &problem);
     track->has_semantics = !semantics.empty();
     if (track->has_semantics) {
       handlers_[semantics].push_back([=](const rosbag::MessageInstance& m) {
@@ -202,8 +201,7 @@ DriveIndex indexDrive(const BagInput& input, const Rig& rig, TfPoseSource* poses
   if (const BagInput::Topic* tf_static = input.find("/tf_static")) {
     rosbag::View statics(input.bag(), rosbag::TopicQuery(tf_static->name));
     for (const rosbag::MessageInstance& message : statics) {
-      guarded(message,
-              [&](const rosbag::MessageInstance& m) { router.addTransforms(m, true); });
+      guarded(message, [&](const rosbag::MessageInstance& m) { router.addTransforms(m, true); });
     }
   }
 

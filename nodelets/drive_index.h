@@ -32,8 +32,8 @@ struct CameraTrack {
 };
 
 struct DriveIndex {
-  std::vector<rosbag::MessageInstance> scans;     ///< in the order of the bag
-  std::vector<CameraTrack> cameras;               ///< in the rig file's order
+  std::vector<rosbag::MessageInstance> scans;       ///< in the order of the bag
+  std::vector<CameraTrack> cameras;                 ///< in the rig file's order
   std::vector<rosbag::MessageInstance> transforms;  ///< tf and tf_static, in the order of the bag
 };
 

@@ -36,9 +36,8 @@ FusionConfig fusionConfig(const Rig& rig) {
 FusionChain::FusionChain(const Rig& rig) : rig_(rig) {
   std::vector<std::string> problems;
   for (const CameraConfig& config : rig_.cameras) {
-    Camera camera{config,
-                  CameraSemantics(rig_.superpixels, rig_.classes.size(), config.score_format),
-                  {}};
+    Camera camera{
+        config, CameraSemantics(rig_.superpixels, rig_.classes.size(), config.score_format), {}};
     if (!config.mask.empty()) {
       camera.ego_mask = cv::imread(config.mask, cv::IMREAD_GRAYSCALE);
       if (camera.ego_mask.empty()) {
@@ -85,15 +84,14 @@ void FusionChain::segment(std::size_t index, SegmentedImage* image) {
         histogramProbabilities(superpixels, image->input, rig_.classes.size());
     return;
   }
-  image->semantics.scores =
-      ScoreMap(image->input, rig_.classes.size(), camera.config.score_format);
+  image->semantics.scores = ScoreMap(image->input, rig_.classes.size(), camera.config.score_format);
   image->share = computeShare(superpixels, image->semantics.scores).share;
   image->semantics.share = image->share;
 }
 
-CompensationResult FusionChain::compensated(
-    const TimedCloud& scan, StampNs reference_ns, const PoseBuffer& odometry,
-    const std::optional<Transform>& T_vehicle_lidar) const {
+CompensationResult FusionChain::compensated(const TimedCloud& scan, StampNs reference_ns,
+                                            const PoseBuffer& odometry,
+                                            const std::optional<Transform>& T_vehicle_lidar) const {
   // Without extrinsics no pose of the lidar is known: the same as odometry that covers nothing.
   const PoseBuffer unknown;
   return compensate(scan, reference_ns, T_vehicle_lidar ? odometry : unknown,

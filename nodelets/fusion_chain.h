@@ -25,19 +25,19 @@ namespace semantic_lidar_fusion {
 
 /// What is known of one image: its pixels and semantics, and what was derived from them.
 struct SegmentedImage {
-  StampNs stamp = 0;            ///< raw
-  cv::Mat image;                ///< CV_8UC1 or CV_8UC3 BGR; empty if nothing needs it
-  cv::Mat input;                ///< scores, labels or probabilities, after the camera's `input`
+  StampNs stamp = 0;  ///< raw
+  cv::Mat image;      ///< CV_8UC1 or CV_8UC3 BGR; empty if nothing needs it
+  cv::Mat input;      ///< scores, labels or probabilities, after the camera's `input`
   std::shared_ptr<const void> owner;  ///< keeps the memory of `image` and `input`
-  cv::Mat superpixel_ids;       ///< empty for probabilities
-  cv::Mat share;                ///< scores only
-  ImageSemantics semantics;     ///< what the projection reads
-  bool from_network = false;    ///< `input` was made by the package's own network
+  cv::Mat superpixel_ids;             ///< empty for probabilities
+  cv::Mat share;                      ///< scores only
+  ImageSemantics semantics;           ///< what the projection reads
+  bool from_network = false;          ///< `input` was made by the package's own network
 };
 
 /// Where one camera stands in one scan.
 struct CameraPlace {
-  std::shared_ptr<const CameraModel> model;  ///< null: no camera_info or no extrinsics
+  std::shared_ptr<const CameraModel> model;          ///< null: no camera_info or no extrinsics
   Transform T_camera_lidar = Transform::Identity();  ///< extrinsics
 };
 

@@ -7,6 +7,7 @@
 #     --build-dir DIR    where to build (default: build/ of the package; build-KIND with --sanitize)
 #     --filter REGEX     only the tests whose ctest name matches
 #     --sanitize KIND    instrument this package's code: address, thread or undefined
+#     --workspace        also build and install in a catkin workspace (compiles everything again)
 #     --jobs N           parallel compilations and tests (default: processors, at most 8)
 #     --install-only     stop after installing the dependencies
 #     --no-install       do not look for missing dependencies
@@ -15,7 +16,7 @@ set -euo pipefail
 PATH=/usr/sbin:/usr/bin:/sbin:/bin
 source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
-usage() { sed -n '3,14s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
+usage() { sed -n '3,15s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
 fail() {
   echo "test.sh: $*" >&2
   exit 2
@@ -28,7 +29,7 @@ broken() {
 }
 needs_value() { [ $# -ge 2 ] && [ -n "$2" ] || fail "$1 needs a value"; }
 
-build_dir="" filter="" sanitize="" install=1 install_only=0
+build_dir="" filter="" sanitize="" install=1 install_only=0 workspace=0
 jobs=$(nproc)
 [ "$jobs" -le 8 ] || jobs=8
 while [ $# -gt 0 ]; do
@@ -37,6 +38,7 @@ while [ $# -gt 0 ]; do
     --filter) needs_value "$@"; filter=$2; shift ;;
     --sanitize) needs_value "$@"; sanitize=$2; shift ;;
     --jobs) needs_value "$@"; jobs=$2; shift ;;
+    --workspace) workspace=1 ;;
     --install-only) install_only=1 ;;
     --no-install) install=0 ;;
     --help | -h) usage; exit 0 ;;
@@ -94,6 +96,7 @@ cmake "$source_dir" -DCMAKE_BUILD_TYPE=Release -DSLF_WERROR=ON -DSLF_SANITIZE="$
 cmake --build . -- -j"$jobs" || broken "the build failed"
 cmake --build . --target tests -- -j"$jobs" || broken "the build of the tests failed"
 
+export SLF_TEST_WORKSPACE=$workspace SLF_JOBS=$jobs
 rm -rf test_results ros_home Testing
 ctest --output-on-failure -j"$jobs" ${filter:+-R "$filter"} </dev/null || true
 exec /usr/bin/python3 "$source_dir/test/gate/gate.py" "$build_dir" ${filter:+--filter "$filter"}
