@@ -31,7 +31,7 @@ def make_parser():
         "form (numbered .jpg and .npz files beside calib_and_kissicp_poses.npz).",
     )
     kitti.add_argument(
-        "--cameras", nargs="+", metavar="FOLDER", help="default: image_02 and image_03"
+        "--cameras", type=_names, metavar="FOLDER,...", help="default: image_02,image_03"
     )
     semantickitti = datasets.add_parser(
         "semantickitti",
@@ -39,7 +39,9 @@ def make_parser():
         description="A SemanticKITTI sequence, dataset/sequences/NN, with image_2 of KITTI odometry; "
         "its labels become the topic points_truth.",
     )
-    semantickitti.add_argument("--cameras", nargs="+", metavar="FOLDER", help="default: image_2")
+    semantickitti.add_argument(
+        "--cameras", type=_names, metavar="FOLDER,...", help="default: image_2"
+    )
     rellis = datasets.add_parser(
         "rellis",
         help="a RELLIS-3D sequence",
@@ -62,11 +64,10 @@ def make_parser():
     )
     rellis.add_argument(
         "--distortion",
-        nargs="+",
-        type=float,
-        default=[],
-        metavar="K",
-        help="k1 k2 p1 p2 [k3] of the camera (default: none, as in camera_info.txt)",
+        choices=["none", "published"],
+        default="none",
+        help="published: the coefficients of the data set's own example (default: none, as in "
+        "camera_info.txt, which fits better)",
     )
     for command in (kitti, semantickitti, rellis):
         command.add_argument("folder", metavar="DIR", help="the folder of the drive or sequence")
@@ -93,6 +94,10 @@ def make_parser():
             "--last", type=_whole, default=None, metavar="N", help="last frame (default: all)"
         )
     return parser
+
+
+def _names(text):
+    return text.split(",")
 
 
 def _whole(text):
@@ -122,7 +127,11 @@ def read_drive(options, labels):
             options.folder, labels, options.cameras, options.first, options.last
         )
     return dataset_rellis.read(
-        options.folder, labels, options.distortion, options.first, options.last
+        options.folder,
+        labels,
+        dataset_rellis.DISTORTIONS[options.distortion],
+        options.first,
+        options.last,
     )
 
 

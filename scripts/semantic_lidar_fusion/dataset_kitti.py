@@ -291,7 +291,7 @@ def unfold_compact(xyz_units: np.ndarray) -> np.ndarray:
     turn = 65536 * _COMPACT_UNIT_M
     direction = xyz[:, 0] + 1j * xyz[:, 1]
     half = 20
-    padded = np.pad(direction / np.maximum(np.abs(direction), 1e-9), half, mode="edge")
+    padded = np.pad(direction / np.maximum(np.abs(direction), 1e-9), half, mode="reflect")
     shape, strides = (len(xyz), 2 * half + 1), padded.strides * 2
     window = np.lib.stride_tricks.as_strided(padded, shape, strides, writeable=False)
     usual = np.conj(np.median(window.real, axis=1) + 1j * np.median(window.imag, axis=1))

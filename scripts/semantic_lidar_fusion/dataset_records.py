@@ -246,18 +246,18 @@ def image_size(data: bytes, path: str) -> Tuple[int, int, str]:
 
 def rings_of_rows(xyz: np.ndarray) -> np.ndarray:
     """(N,) u16 ring, 0 = lowest, of a KITTI scan, whose points come laser by laser from the top one
-    down, each once around to the left from straight ahead: a laser ends where the azimuth falls by
-    more than half a turn. Falls beyond 63 are taken for outliers: the largest count."""
+    down, each once around to the left from straight ahead: a new laser starts where the azimuth
+    falls back (by more than 30 deg; of more than 63 falls the largest)."""
     if not len(xyz):
         return np.zeros(0, dtype=np.uint16)
     azimuth = np.mod(np.arctan2(xyz[:, 1], xyz[:, 0]), 2 * np.pi)
     fall = azimuth[:-1] - azimuth[1:]
-    ends = np.flatnonzero(fall > np.pi)
+    ends = np.flatnonzero(fall > np.radians(30.0))
     if len(ends) > HDL64_RINGS - 1:
-        ends = np.sort(ends[np.argsort(-fall[ends], kind="stable")[: HDL64_RINGS - 1]])
-    row = np.zeros(len(xyz), dtype=np.int64)
-    row[ends + 1] = 1
-    row = np.cumsum(row)
+        ends = ends[np.argsort(-fall[ends], kind="stable")[: HDL64_RINGS - 1]]
+    starts = np.zeros(len(xyz), dtype=np.int64)
+    starts[ends + 1] = 1
+    row = np.cumsum(starts)
     return (row[-1] - row).astype(np.uint16)
 
 

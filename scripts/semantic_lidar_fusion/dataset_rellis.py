@@ -15,7 +15,7 @@ middle of the scan, and motion is disabled for want of poses.
 
 The camera is a pinhole, as camera_info.txt says. The data set's own projection example adds the
 distortion -0.134313, -0.025905, 0.002181, 0.00084; on the frame that is at hand, points and human
-labels agree better without it (77.3 against 76.9 %), so it is an option.
+labels agree better without it (77.3 against 76.9 %), so it is an option (`published`).
 `base_link` is the lidar (`os1_cloud_node`).
 """
 
@@ -35,6 +35,7 @@ LIDAR_FRAME = "os1_cloud_node"
 LIDAR_TOPIC = "/os1_cloud_node/points"
 CAMERA = "pylon"
 CAMERA_FRAME = "pylon_camera_node"
+DISTORTIONS = {"none": (), "published": (-0.134313, -0.025905, 0.002181, 0.00084)}
 _COMPACT_FILE = "frame.npz"
 
 # Ids of the label images and scans -> names in the class sets, best first.
@@ -87,7 +88,7 @@ def read(
     first: int,
     last: Optional[int],
 ) -> records.Drive:
-    """A sequence or the compact frame. `distortion`: plumb_bob coefficients (4 or 5), or none."""
+    """A sequence or the compact frame. `distortion`: k1 k2 p1 p2 [k3] of plumb_bob, or empty."""
     folder = os.path.abspath(records.require_folder(folder))
     if os.path.isfile(os.path.join(folder, _COMPACT_FILE)):
         return _read_compact(folder, labels, distortion)
@@ -208,13 +209,9 @@ def _camera(
     distortion: Sequence[float],
     images: List[records.ImageRecord],
 ) -> records.CameraRecord:
-    d = [float(value) for value in distortion]
-    if len(d) not in (0, 4, 5):
-        raise DataError("--distortion: %d numbers; must be 4 or 5" % len(d))
-    model = "plumb_bob"
-    d = d + [0.0] * (5 - len(d))
+    d = [float(value) for value in distortion] + [0.0] * (5 - len(distortion))
     return records.CameraRecord(
-        CAMERA, CAMERA_FRAME, LIDAR_FRAME, t_lidar_camera, k, model, d, False, images
+        CAMERA, CAMERA_FRAME, LIDAR_FRAME, t_lidar_camera, k, "plumb_bob", d, False, images
     )
 
 

@@ -8,6 +8,7 @@
 #include <cstring>
 #include <utility>
 
+#include "range_limits.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/lidar/firing_times.h"
 
@@ -257,8 +258,7 @@ class ScanWriter {
         continue;
       }
       const double distance = raw_distance * unit;
-      if (distance < config_.min_range_m ||
-          (config_.max_range_m > 0.0 && distance > config_.max_range_m)) {
+      if (outOfRange(distance, config_.min_range_m, config_.max_range_m)) {
         ++counters_.out_of_range_points;
         continue;
       }
@@ -331,19 +331,7 @@ std::vector<const Packet*> cleaned(const std::vector<Packet>& packets, PacketCou
 
 PacketDecoder::PacketDecoder(PacketDecoderConfig config) : config_(std::move(config)) {
   std::vector<std::string> problems;
-  const auto checkRange = [&](const char* key, double value) {
-    if (!std::isfinite(value) || value < 0.0) {
-      problems.push_back(std::string("lidar.") + key + " is " + std::to_string(value) +
-                         ", must be 0 (no limit) or more");
-    }
-  };
-  checkRange("min_range_m", config_.min_range_m);
-  checkRange("max_range_m", config_.max_range_m);
-  if (config_.max_range_m > 0.0 && config_.min_range_m >= config_.max_range_m) {
-    problems.push_back("lidar.min_range_m is " + std::to_string(config_.min_range_m) +
-                       ", must be less than max_range_m, which is " +
-                       std::to_string(config_.max_range_m));
-  }
+  checkRangeLimits(config_.min_range_m, config_.max_range_m, problems);
   const std::size_t offsets = config_.vertical_offsets_m.size();
   if (config_.model) {
     const FiringTimes& times = firingTimes(*config_.model);

@@ -14,6 +14,7 @@
 #include "semantic_lidar_fusion/common/label_set.h"
 #include "semantic_lidar_fusion/fusion/camera_merger.h"
 #include "semantic_lidar_fusion/lidar/packet.h"
+#include "semantic_lidar_fusion/lidar/point_cloud_reader.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
 #include "semantic_lidar_fusion/projection/occlusion_mask.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
@@ -47,9 +48,6 @@ struct CameraConfig {
 };
 
 enum class LidarInput : std::uint8_t { kPackets, kPoints };
-enum class TimeUnit : std::uint8_t { kAuto, kSeconds, kMilliseconds, kMicroseconds, kNanoseconds };
-enum class TimeReference : std::uint8_t { kAuto, kStamp, kAbsolute, kScanEnd };
-enum class WithoutTime : std::uint8_t { kReject, kInstant, kAzimuth };
 
 struct LidarConfig {
   LidarInput input = LidarInput::kPackets;
