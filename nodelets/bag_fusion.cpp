@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cstdio>
+#include <limits>
 #include <set>
 #include <utility>
 
@@ -129,7 +130,7 @@ bool BagFusion::isCandidate(std::size_t camera, StampNs stamp) const {
 /// Each scan is decided with all stamps that may matter to it, as if nothing more would come: the
 /// selector's bounds on memory and its timeouts, made for a live stream, do not touch the result.
 void BagFusion::select() {
-  const SelectorConfig config = rig_.selectorConfig();
+  SelectorConfig config = rig_.selectorConfig();
   std::vector<std::map<StampNs, StampNs>> candidates(rig_.cameras.size());  // true time -> stamp
   StampNs reach_ns = config.reference_timeout_ns;
   for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
@@ -140,6 +141,7 @@ void BagFusion::select() {
       candidates[c][image.first + config.cameras[c].time_offset_ns] = image.first;
     }
   }
+  config.image_history_ns = std::numeric_limits<StampNs>::max() / 4;
   std::set<StampNs> seen;
   for (Scan& scan : scans_) {
     if (!scan.usable) continue;
