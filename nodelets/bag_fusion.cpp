@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <cstdio>
 #include <limits>
+#include <set>
 #include <utility>
 
 #include "conversions.h"
@@ -22,14 +23,6 @@ namespace {
 /// Images of one camera that are kept after use.
 constexpr std::size_t kRecentImages = 3;
 
-/// Nothing is forgotten and nothing is late: all stamps are known.
-SelectorConfig offlineSelector(const Rig& rig) {
-  SelectorConfig config = rig.selectorConfig();
-  config.max_pending_scans = std::numeric_limits<std::size_t>::max();
-  config.image_history_ns = std::numeric_limits<StampNs>::max();
-  return config;
-}
-
 std::string percent(std::uint64_t part, std::uint64_t whole) {
   char text[16];
   std::snprintf(text, sizeof(text), "%.1f %%",
@@ -39,6 +32,15 @@ std::string percent(std::uint64_t part, std::uint64_t whole) {
 
 std::string count(std::uint64_t n, const std::string& thing) {
   return std::to_string(n) + " " + thing + (n == 1 ? "" : "s");
+}
+
+void checkSize(const SegmentedImage& image, const ImageSize& wanted) {
+  if (image.image.empty()) return;
+  if (image.image.cols != wanted.width || image.image.rows != wanted.height) {
+    throw DataError("is " + std::to_string(image.image.cols) + "x" +
+                    std::to_string(image.image.rows) + "; camera_info says " +
+                    std::to_string(wanted.width) + "x" + std::to_string(wanted.height));
+  }
 }
 
 const char* const kStatusNames[] = {"fused", "occluded", "outside", "no image", "no odometry"};
@@ -51,7 +53,10 @@ BagFusion::BagFusion(const FuseBagOptions& options, void (*checkpoint)())
       started_(std::chrono::steady_clock::now()),
       rig_(loadRig(options.rig, options.overrides)),
       chain_(rig_),
-      lidar_(rig_.lidar),
+      lidar_(rig_.lidar,
+             [this](const std::string& reason, std::uint64_t n) {
+               if (counts_points_) drops_.add("lidar: " + reason, n);
+             }),
       input_(options.input),
       poses_(tfPoseSourceConfig(rig_, 0)),
       cameras_(rig_.cameras.size()) {}
@@ -70,6 +75,17 @@ void BagFusion::run() {
   output.commit();
 }
 
+TimedCloud BagFusion::decode(const rosbag::MessageInstance& message) {
+  if (rig_.lidar.input == LidarInput::kPackets) {
+    const auto scan = message.instantiate<VelodyneScan>();
+    if (!scan) throw DataError("has another definition of velodyne_msgs/VelodyneScan");
+    return lidar_.decode(*scan);
+  }
+  const auto cloud = message.instantiate<sensor_msgs::PointCloud2>();
+  if (!cloud) throw DataError("has another definition of sensor_msgs/PointCloud2");
+  return lidar_.decode(*cloud);
+}
+
 /// Decodes each scan for its times; its points are decoded again when it is fused, which costs
 /// less than keeping them.
 void BagFusion::measureScans() {
@@ -80,7 +96,7 @@ void BagFusion::measureScans() {
     scan.message = &message;
     scan.image_stamps.resize(rig_.cameras.size());
     try {
-      const TimedCloud cloud = lidar_.decode(message);
+      const TimedCloud cloud = decode(message);
       scan.times.interval = scanInterval(cloud);
       scan.empty = cloud.empty();
       scan.usable = true;
@@ -100,6 +116,8 @@ void BagFusion::measureScans() {
     progress.update(scans_.size());
     checkpoint_();
   }
+  counts_points_ = false;
+  if (lidar_.timeDecisionIsDoubtful()) DropLog::warn("lidar: " + lidar_.timeDecision());
 }
 
 /// An image can be chosen if what its camera contributes is there.
@@ -109,56 +127,53 @@ bool BagFusion::isCandidate(std::size_t camera, StampNs stamp) const {
   return rig_.cameras[camera].input == CameraInput::kScores && !rig_.segmentation.model.empty();
 }
 
+/// Each scan is decided with all stamps that may matter to it, as if nothing more would come: the
+/// selector's bounds on memory and its timeouts, made for a live stream, do not touch the result.
 void BagFusion::select() {
-  ScanSelector selector(offlineSelector(rig_));
-  // In order of true time, as if all had come on the wire.
-  struct Event {
-    StampNs time_ns;
-    int camera;  ///< -1: a scan
-    StampNs stamp;
-    const Scan* scan;
-  };
-  std::vector<Event> events;
+  SelectorConfig config = rig_.selectorConfig();
+  std::vector<std::map<StampNs, StampNs>> candidates(rig_.cameras.size());  // true time -> stamp
+  StampNs reach_ns = config.reference_timeout_ns;
   for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
     const CameraTrack& track = index_.cameras[c];
-    const MessagesByStamp& stamps = track.has_images ? track.images : track.semantics;
-    for (const auto& image : stamps) {
+    reach_ns = std::max(reach_ns, config.cameras[c].max_time_difference_ns);
+    for (const auto& image : track.has_images ? track.images : track.semantics) {
       if (!isCandidate(c, image.first)) continue;
-      events.push_back({image.first + toNs(rig_.cameras[c].time_offset_s), static_cast<int>(c),
-                        image.first, nullptr});
+      candidates[c][image.first + config.cameras[c].time_offset_ns] = image.first;
     }
   }
-  std::map<StampNs, Scan*> by_first_point;
+  config.image_history_ns = std::numeric_limits<StampNs>::max() / 4;
+  std::set<StampNs> seen;
   for (Scan& scan : scans_) {
     if (!scan.usable) continue;
-    const StampNs first = scan.times.interval.first_ns;
-    if (scan.empty) {  // no time to choose by: stamped with its header
-      scan.reference_ns = first;
-    } else if (!by_first_point.emplace(first, &scan).second) {
+    const ScanInterval& interval = scan.times.interval;
+    if (!seen.insert(interval.first_ns).second) {
       scan.usable = false;
       drops_.count("scans: first point seen twice", "second scan with its first point at " +
-                                                        std::to_string(first) + " ns is dropped");
-    } else {
-      events.push_back({first, -1, 0, &scan});
+                                                        std::to_string(interval.first_ns) +
+                                                        " ns is dropped");
+      continue;
     }
-  }
-  std::stable_sort(events.begin(), events.end(), [](const Event& a, const Event& b) {
-    return std::make_pair(a.time_ns, a.camera) < std::make_pair(b.time_ns, b.camera);
-  });
-  for (const Event& event : events) {
-    if (event.scan) {
-      selector.addScan(event.scan->times, event.time_ns);
-    } else {
-      selector.addImage(event.camera, event.stamp);
+    if (scan.empty) {  // no time to choose by: stamped with its header
+      scan.reference_ns = interval.first_ns;
+      continue;
     }
-  }
-  const SelectorDecisions decisions = selector.finish();
-  for (const ReferenceDecision& decision : decisions.references) {
-    by_first_point.at(decision.scan_ns)->reference_ns = decision.reference_ns;
-  }
-  for (const SelectionDecision& decision : decisions.selections) {
-    by_first_point.at(decision.scan_ns)->image_stamps[static_cast<std::size_t>(decision.camera)] =
-        decision.image_stamp;
+    ScanSelector selector(config);
+    selector.addScan(scan.times, 0);
+    // t_ref is at most `reach_ns` off the scan, an image at most that off t_ref.
+    for (std::size_t c = 0; c < candidates.size(); ++c) {
+      for (auto image = candidates[c].lower_bound(interval.first_ns - 2 * reach_ns);
+           image != candidates[c].end() && image->first <= interval.last_ns + 2 * reach_ns;
+           ++image) {
+        selector.addImage(static_cast<int>(c), image->second);
+      }
+    }
+    const SelectorDecisions decisions = selector.finish();
+    for (const ReferenceDecision& decision : decisions.references) {
+      scan.reference_ns = decision.reference_ns;
+    }
+    for (const SelectionDecision& decision : decisions.selections) {
+      scan.image_stamps[static_cast<std::size_t>(decision.camera)] = decision.image_stamp;
+    }
   }
 }
 
@@ -183,7 +198,7 @@ void BagFusion::fuseScans(BagOutput* output) {
 void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
   const std::size_t camera_count = rig_.cameras.size();
   const StampNs scan_ns = scan.times.interval.first_ns;
-  const TimedCloud raw = lidar_.decode(*scan.message);
+  const TimedCloud raw = decode(*scan.message);
   const std::optional<Transform> T_vehicle_lidar =
       rig_.motion_enabled ? extrinsics(rig_.vehicle_frame, raw.frame_id, "all points have status 4")
                           : std::nullopt;
@@ -323,7 +338,7 @@ std::shared_ptr<const SegmentedImage> BagFusion::segmentedImage(std::size_t came
   }
   try {
     const std::shared_ptr<SegmentedImage> image = loadImage(camera, stamp);
-    checkSize(camera, *image, place);
+    checkSize(*image, place.model->imageSize());
     chain_.segment(camera, image.get());
     if (options_.all) writeImageProducts(camera, *image, output);
     state.recent.push_back(image);
@@ -367,17 +382,6 @@ std::shared_ptr<SegmentedImage> BagFusion::loadImage(std::size_t camera, StampNs
     result->input = pixelView(*messages->semantics);
   }
   return result;
-}
-
-void BagFusion::checkSize(std::size_t, const SegmentedImage& image,
-                          const CameraPlace& place) const {
-  if (image.image.empty()) return;
-  const ImageSize wanted = place.model->imageSize();
-  if (image.image.cols != wanted.width || image.image.rows != wanted.height) {
-    throw DataError("is " + std::to_string(image.image.cols) + "x" +
-                    std::to_string(image.image.rows) + "; camera_info says " +
-                    std::to_string(wanted.width) + "x" + std::to_string(wanted.height));
-  }
 }
 
 void BagFusion::writeImageProducts(std::size_t camera, const SegmentedImage& image,

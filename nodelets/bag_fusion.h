@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-/// The whole pipeline over a bag, scan by scan. Decisions come from the core's ScanSelector, fed
-/// with all stamps at once, so that they depend on stamps alone.
+/// The whole pipeline over a bag, scan by scan. Decisions come from the core's ScanSelector and
+/// depend on stamps alone.
 #pragma once
 
 #include <array>
@@ -19,7 +19,7 @@
 #include "drop_log.h"
 #include "fuse_bag_options.h"
 #include "fusion_chain.h"
-#include "lidar_input.h"
+#include "lidar_decoder.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 #include "tf_pose_source.h"
 
@@ -63,6 +63,7 @@ class BagFusion {
   void fuseScan(const Scan& scan, BagOutput* output);
   void copyTransforms(BagOutput* output);
 
+  TimedCloud decode(const rosbag::MessageInstance& message);
   bool isCandidate(std::size_t camera, StampNs stamp) const;
   CameraPlace place(std::size_t camera, const ros::Time& time, const std::string& lidar_frame);
   std::shared_ptr<const CameraModel> model(std::size_t camera, const CameraInfo& info);
@@ -71,7 +72,6 @@ class BagFusion {
   std::shared_ptr<const SegmentedImage> segmentedImage(std::size_t camera, StampNs stamp,
                                                        const CameraPlace& place, BagOutput* output);
   std::shared_ptr<SegmentedImage> loadImage(std::size_t camera, StampNs stamp) const;
-  void checkSize(std::size_t camera, const SegmentedImage& image, const CameraPlace& place) const;
   void writeImageProducts(std::size_t camera, const SegmentedImage& image, BagOutput* output);
   void writeOverlays(const FusionResult& result,
                      const std::vector<std::shared_ptr<const SegmentedImage>>& images,
@@ -81,12 +81,13 @@ class BagFusion {
   FuseBagOptions options_;
   void (*checkpoint_)();
   std::chrono::steady_clock::time_point started_;
+  DropLog drops_;
+  bool counts_points_ = true;  ///< scans are decoded twice, their points are counted once
   Rig rig_;
   FusionChain chain_;
-  LidarInputDecoder lidar_;
+  LidarDecoder lidar_;
   BagInput input_;
   TfPoseSource poses_;
-  DropLog drops_;
   DriveIndex index_;
   std::vector<Scan> scans_;
   std::vector<CameraState> cameras_;
