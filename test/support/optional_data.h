@@ -19,6 +19,6 @@ inline bool readable(const std::string& path) { return std::ifstream(path).good(
 }  // namespace semantic_lidar_fusion
 
 /// Ends a test as skipped unless the file `relative` of the optional data is readable.
-#define SLF_SKIP_WITHOUT(relative)                                                          \
-  if (!::semantic_lidar_fusion::readable(::semantic_lidar_fusion::sharedPath(relative)))    \
+#define SLF_SKIP_WITHOUT(relative)                                                       \
+  if (!::semantic_lidar_fusion::readable(::semantic_lidar_fusion::sharedPath(relative))) \
   GTEST_SKIP() << "optional data not found: " << relative

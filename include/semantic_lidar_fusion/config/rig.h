@@ -14,6 +14,7 @@
 #include "semantic_lidar_fusion/common/label_set.h"
 #include "semantic_lidar_fusion/fusion/camera_merger.h"
 #include "semantic_lidar_fusion/lidar/packet.h"
+#include "semantic_lidar_fusion/lidar/point_cloud_reader.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
 #include "semantic_lidar_fusion/projection/occlusion_mask.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
@@ -43,12 +44,10 @@ struct CameraConfig {
   double time_offset_s = 0.0;           ///< key time_offset
   double max_time_difference_s = 0.05;  ///< key max_time_difference
   double timeout_s = 0.2;               ///< key timeout
+  double reorder_window_s = 0.0;        ///< key reorder_window; see SelectorCamera
 };
 
 enum class LidarInput : std::uint8_t { kPackets, kPoints };
-enum class TimeUnit : std::uint8_t { kAuto, kSeconds, kMilliseconds, kMicroseconds, kNanoseconds };
-enum class TimeReference : std::uint8_t { kAuto, kStamp, kAbsolute, kScanEnd };
-enum class WithoutTime : std::uint8_t { kReject, kInstant, kAzimuth };
 
 struct LidarConfig {
   LidarInput input = LidarInput::kPackets;
@@ -100,8 +99,8 @@ struct SegmentationConfig {
 };
 
 struct Rig {
-  std::string name;
-  LabelSet classes;                   ///< key `classes`: {file: PATH} or a class set in place
+  std::string name;                   ///< default: the rig file's, without extension
+  LabelSet classes;                   ///< key `classes`: {file: PATH}, a path or a set in place
   std::vector<CameraConfig> cameras;  ///< at most 16; the position is the bit in `cameras`
   LidarConfig lidar;
   std::string fixed_frame = "odom";
@@ -125,9 +124,8 @@ struct Rig {
 };
 
 /// Loads and checks. `overrides`: "key=value", keys with dots ("occlusion.mode=paper"), cameras by
-/// name
-/// ("cameras.A0.max_theta_deg=50"), values in YAML; applied before checking. Throws ConfigError
-/// with every problem.
+/// name ("cameras.A0.max_theta_deg=50"), other list elements by position, values in YAML, no value
+/// for an empty text; applied in order before checking. Throws ConfigError with every problem.
 Rig loadRig(const std::string& path, const std::vector<std::string>& overrides = {});
 /// The same for a tree that is already in memory; relative paths are relative to `base_directory`.
 Rig rigFromYaml(const YAML::Node& root, const std::string& base_directory,

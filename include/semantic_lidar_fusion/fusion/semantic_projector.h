@@ -16,11 +16,14 @@
 
 namespace semantic_lidar_fusion {
 
-/// The semantics of one image, at any of the three stages; exactly one of the inputs is set.
+/// The semantics of one image: either scores with their share, or probabilities (also those of
+/// label images, see histogramProbabilities). Any resolution: image pixel -> superpixel pixel q ->
+/// score cell under q's centre.
 struct ImageSemantics {
-  ScoreMap scores;        ///< with `share`: evaluated lazily at visible points
+  ScoreMap scores;        ///< with `share`: softmax evaluated lazily at visible points
   cv::Mat share;          ///< CV_32FC1, superpixel resolution
-  cv::Mat probabilities;  ///< CV_32FC(n), superpixel resolution
+  cv::Mat probabilities;  ///< CV_32FC(n), superpixel resolution; rows that do not sum to 1 are
+                          ///< normalised
 };
 
 /// What one camera brings to one scan.
@@ -29,7 +32,7 @@ struct CameraView {
   int rig_index = 0;                         ///< bit of the `cameras` field
   std::shared_ptr<const CameraModel> model;  ///< null: camera_info never came, status 2
   Transform T_camera_lidar_static = Transform::Identity();  ///< extrinsics alone, judges status 3
-  cv::Mat ego_mask;        ///< CV_8UC1 or empty; 0 = never transfer
+  cv::Mat ego_mask;        ///< CV_8UC1 of any size, or empty; 0 = never transfer
   bool has_image = false;  ///< an image in time, with odometry and semantics
   StampNs image_ns = 0;    ///< true time of the image
   Transform T_camera_lidar = Transform::Identity();  ///< lidar at t_ref to camera at image_ns
@@ -44,13 +47,15 @@ struct FusionConfig {
   bool keep_unlabelled = true;  ///< false: only fused points come out, as in the paper
 };
 
-/// Where the points of one camera went; for overlays and diagnostics.
+/// Where the points of one camera went; for overlays and diagnostics. Empty without an image.
 struct CameraFusionReport {
   std::string name;
   std::vector<std::uint32_t> index;  ///< into the input cloud: the points within the image
   std::vector<float> u, v;           ///< px
   std::vector<PointStatus> status;   ///< kFused, kOccluded or kOutsideImages (ego mask)
-  std::size_t nonfinite = 0;         ///< visible points on a non-finite score cell (uniform P)
+  std::vector<std::uint8_t> label;   ///< the point's label over all cameras, kNoLabel = none
+  std::size_t nonfinite = 0;  ///< visible points given a uniform P: score not finite, share outside
+                              ///< (0, 1] or probabilities that are no distribution
 };
 
 struct FusionResult {
@@ -58,13 +63,19 @@ struct FusionResult {
   std::vector<CameraFusionReport> cameras;  ///< sorted by name
 };
 
+/// Stateless between scans; `fuse` may run in several threads.
 class SemanticProjector {
  public:
-  /// Throws ConfigError.
+  /// Throws ConfigError with every problem.
   explicit SemanticProjector(const FusionConfig& config);
 
-  /// The order of `views` does not matter. Throws DataError if a view's scores, share,
-  /// probabilities or mask do not fit the configuration or its model.
+  /// The status of a point is the best any camera gives it, 0 before 1 before 3 before 2. A camera
+  /// with an image gives 0 (visible), 1 (hidden) or 2 (not in the image, or on a masked pixel, even
+  /// if hidden); one without an image gives 3 where its static extrinsics put the point on a pixel
+  /// that is not masked; one without a model gives 2. Points with status kNoOdometry keep it.
+  ///
+  /// The order of `views` does not matter. Throws DataError if names or rig indices repeat, if a
+  /// view's scores, share, probabilities or mask do not fit the configuration, or as beamGrid does.
   FusionResult fuse(const Cloud& cloud, std::vector<CameraView> views) const;
 
  private:

@@ -1,12 +1,20 @@
 // SPDX-License-Identifier: MIT
 /// A semantic segmentation network run by OpenCV DNN, described by a model file (YAML):
-///   file: network.onnx            # relative to the model file
-///   input: {width: 1024, height: 512, channels: rgb|bgr, scale: 0.00392157, mean: [r, g, b],
-///           std: [r, g, b]}       # x = (scale * value - mean) / std, channel order as `channels`
+///   file: network.onnx            # relative to the model file; the network itself is the user's
+///   input:
+///     width: 1024                 # what the network takes; images are resized to it
+///     height: 512
+///     channels: rgb               # or bgr: order of the network's input channels
+///     scale: 0.00392157           # x = (scale * value - mean) / std, value 0..255;
+///     mean: [0.485, 0.456, 0.406] # mean and std in the order of `channels`
+///     std: [0.229, 0.224, 0.225]  # defaults: rgb, scale 1/255, mean 0, std 1
 ///   classes: {road: [0], ...}     # rig class name -> output channels; S(c) = log-sum-exp of them
-///   ignore: [19]                  # output channels of no class
+///   ignore: [19]                  # output channels of no class; default none
 /// Every output channel must occur once; a rig class without a channel gets the least score of the
-/// cell minus 20 (its probability vanishes).
+/// cell's classes minus 20 (its probability vanishes).
+///
+/// `classes` may also be a list of {classes: {...}, ignore: [...]}, one for each class set that the
+/// network serves: the first whose names are all in the rig's class set is used.
 #pragma once
 
 #include <memory>
@@ -23,8 +31,10 @@ class SegmentationModel {
   SegmentationModel(const std::string& model_file, const LabelSet& classes);
   ~SegmentationModel();
 
-  /// Unnormalised scores CV_32FC(class count) at the network's output size. `image`: CV_8UC1 or
-  /// CV_8UC3 BGR, resized to the input. Not thread-safe. Throws DataError.
+  /// Unnormalised scores CV_32FC(class count) at the network's output size, not shared with the
+  /// model. `image`: CV_8UC1 or CV_8UC3 BGR of any size, resized to the input (by area where it
+  /// shrinks both ways, else bilinear; the aspect ratio is not kept). Not thread-safe. Throws
+  /// DataError.
   cv::Mat scores(const cv::Mat& image);
 
  private:

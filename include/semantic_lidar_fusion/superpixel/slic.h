@@ -25,9 +25,10 @@ class Slic {
   /// Throws ConfigError.
   explicit Slic(const SlicConfig& config);
 
-  /// `image`: CV_8UC1 or CV_8UC3 (BGR), any size from 1x1. The map has `map_size` (not larger than
-  /// the image; the image is reduced by box averaging first). Obtains the clamped count within 10
-  /// %. Deterministic. Throws DataError on an empty image or another type.
+  /// `image`: CV_8UC1 or CV_8UC3 (BGR), any size from 1x1. The map has `map_size`, the image being
+  /// brought to it by averaging over each map pixel's box (exact, also for a map that is larger).
+  /// Obtains clampedSuperpixelCount within 10 %; ids are in raster order of first appearance.
+  /// Deterministic. Throws DataError on an empty image, another type, or a map size below 1x1.
   SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size);
 
  private:

@@ -3,13 +3,23 @@
 ///
 /// t_ref is the true time of the reference camera's image closest to the middle of the scan
 /// ("closest camera image timestamp" of the paper); each camera then contributes its image closest
-/// to its own target. The class has no clock: `advance` passes the current time in, and the
-/// decisions do not depend on the order of arrival as long as no timeout passes.
+/// to its own target. Of two equally close images the earlier wins. t_ref never waits for other
+/// cameras. The class has no clock: `advance` passes the current time in.
 ///
-/// A decision is settled as soon as a stamp at or after its target is known (stamps of one camera
-/// may arrive late or twice, but are bounded by the timeout), else when the timeout has passed
-/// since the scan was added. Of two equally close images the earlier wins. t_ref never waits for
-/// other cameras.
+/// Settling. A decision is settled as soon as a stamp at or after its target is known, else when
+/// the timeout has passed since the scan was added: t_ref is then the middle of the scan, a camera
+/// gives the closest image that it has. An image further from the middle than the reference timeout
+/// is not in time either, even if it is known. Decisions therefore depend on stamps alone, however
+/// scans, cameras and duplicates interleave, as long as no timeout passes and the images of each
+/// camera arrive in the order of their stamps (one connection delivers them so) or at most
+/// `reorder_window_ns` out of it. An image that comes too late to be chosen changes nothing and is
+/// counted.
+///
+/// Epochs. A stamp more than kBackwardJumpNs before the newest of its own stream (a camera, the
+/// scans) is a bag that starts anew: scans and images are forgotten. A stamp more than
+/// kForwardJumpNs after the newest of all streams ends the past: pending scans are settled with
+/// what is known, then all is forgotten. Jumps of a clock, and bags shorter than kBackwardJumpNs,
+/// are the caller's to see and to `reset`.
 #pragma once
 
 #include <cstdint>
@@ -31,6 +41,9 @@ struct SelectorCamera {
   StampNs time_offset_ns = 0;                 ///< true time = raw stamp + this
   StampNs max_time_difference_ns = 50000000;  ///< an image further from the target is none
   StampNs timeout_ns = 200000000;  ///< wait for this camera's images, from the scan's arrival
+  /// How far images may overtake each other: a decision waits for a stamp this far beyond the
+  /// image that settles it. 0 for images that arrive in the order of their stamps.
+  StampNs reorder_window_ns = 0;
 };
 
 struct SelectorConfig {
@@ -39,8 +52,9 @@ struct SelectorConfig {
   int reference_camera = 0;  ///< index into `cameras`
   StampNs reference_timeout_ns = 200000000;
   ImageChoice image_choice = ImageChoice::kClosestToReference;
-  std::size_t max_pending_scans = 4;      ///< the oldest is dropped and counted
-  StampNs image_history_ns = 2000000000;  ///< stamps older than the newest by more are forgotten
+  std::size_t max_pending_scans = 4;  ///< the oldest is dropped and counted
+  /// Stamps older than their camera's newest by more are forgotten; at least kBackwardJumpNs.
+  StampNs image_history_ns = 2000000000;
 };
 
 /// What the selector needs to know of a scan.
@@ -58,7 +72,7 @@ struct ReferenceDecision {
   bool timed_out = false;    ///< no image in time: t_ref is the middle of the scan
 };
 
-/// The image of one camera for one scan is settled.
+/// The image of one camera for one scan is settled; its t_ref always is, earlier or at once.
 struct SelectionDecision {
   StampNs scan_ns = 0;
   int camera = 0;
@@ -66,37 +80,62 @@ struct SelectionDecision {
   bool timed_out = false;              ///< decided without an image at or after the target
 };
 
+enum class DropReason : std::uint8_t {
+  kQueueFull,  ///< more than max_pending_scans waited for t_ref
+  kNewEpoch,   ///< stamps or clock went back
+};
+
+/// A scan that gets no further decision.
+struct DroppedScan {
+  StampNs scan_ns = 0;
+  DropReason reason = DropReason::kQueueFull;
+};
+
 struct SelectorDecisions {
-  std::vector<ReferenceDecision> references;
-  std::vector<SelectionDecision> selections;  ///< scan by scan, then by camera index
+  std::vector<ReferenceDecision> references;  ///< oldest scan first
+  std::vector<SelectionDecision> selections;  ///< oldest scan first, then by camera index
+  std::vector<DroppedScan> dropped;           ///< in the order of their drops
 };
 
 struct SelectorCounters {
   std::uint64_t scans = 0;
-  std::uint64_t scans_dropped_pending = 0;  ///< the queue of pending scans was full
+  std::uint64_t scans_dropped_pending = 0;  ///< DropReason::kQueueFull
+  std::uint64_t scans_dropped_epoch = 0;    ///< DropReason::kNewEpoch
   std::uint64_t scans_duplicate = 0;        ///< a scan with this first stamp is known
   std::uint64_t reference_timeouts = 0;
   std::uint64_t images = 0;
   std::uint64_t images_duplicate = 0;
-  std::uint64_t epochs = 0;                    ///< resets by a backward or large forward jump
+  std::uint64_t images_late = 0;  ///< would have been chosen, had they come before the decision
+  std::uint64_t epochs = 0;       ///< resets by a backward or large forward jump
   std::vector<std::uint64_t> camera_timeouts;  ///< per camera
   std::vector<std::uint64_t> camera_none;      ///< per camera: no image within the limit
 };
 
 class ScanSelector {
  public:
+  static constexpr StampNs kBackwardJumpNs = kNsPerSecond;
+  static constexpr StampNs kForwardJumpNs = 5 * kNsPerSecond;
+  /// Largest magnitude of a stamp; ROS stamps reach 4.3e18.
+  static constexpr StampNs kMaxStampNs = StampNs{1} << 62;
+
   /// Throws ConfigError.
   explicit ScanSelector(SelectorConfig config);
 
-  /// `now_ns`: time of arrival on the clock that `advance` uses.
+  /// `now_ns`: time of arrival on the clock that `advance` uses. A full queue gives up its oldest
+  /// scan: with the images known so far if its t_ref is settled, else it is dropped. Throws
+  /// DataError on an interval or sweep times that make no sense.
   void addScan(const SelectorScan& scan, StampNs now_ns);
-  /// `stamp`: raw stamp of an image of camera `camera`.
+  /// `stamp`: raw stamp of an image of camera `camera`. Stamps come in roughly the order of the
+  /// scans: `image_history_ns` is all that is kept. Throws DataError on an unknown camera or a
+  /// stamp beyond kMaxStampNs.
   void addImage(int camera, StampNs stamp);
-  /// Settles what can be settled at `now_ns`; decisions come once, oldest scan first.
+  /// Settles what can be settled at `now_ns`; each decision comes once. To be called after every
+  /// addition, and when a timeout may have passed.
   SelectorDecisions advance(StampNs now_ns);
   /// No more stamps will come: settles everything.
   SelectorDecisions finish();
-  /// Forgets scans and images, keeps counters (a clock jump, a bag that starts anew).
+  /// Forgets scans and images, keeps counters (a clock jump, a bag that starts anew); the next
+  /// `advance` names the scans that were pending.
   void reset();
 
   std::size_t pendingScans() const { return pending_.size(); }
@@ -109,12 +148,34 @@ class ScanSelector {
     std::optional<StampNs> reference_ns;
     std::vector<bool> settled;  ///< per camera
   };
+  /// A decision made; an image nearer to the target than `difference_ns` would have changed it.
+  struct Settled {
+    StampNs target_ns = 0;
+    StampNs difference_ns = 0;
+  };
+  struct CameraState {
+    std::set<StampNs> images;     ///< true times
+    std::deque<Settled> settled;  ///< the last few
+  };
+  enum class Waiting : std::uint8_t { kAsConfigured, kNoLonger };
 
-  SelectorDecisions settle(StampNs now_ns, bool final);
+  void startEpochIfJumped(StampNs stamp_ns, std::optional<StampNs> newest_of_stream_ns);
+  void forget();
+  void makeRoom();
+  /// Settles what it can of the scan; true if nothing is left.
+  bool settleScan(PendingScan* pending, StampNs now_ns, Waiting waiting);
+  void settleReference(PendingScan* pending, StampNs waited_ns, Waiting waiting);
+  void settleCamera(PendingScan* pending, int camera, StampNs waited_ns, Waiting waiting);
+  void settleAll(StampNs now_ns, Waiting waiting);
+  void remember(int camera, StampNs target_ns, StampNs difference_ns);
+  SelectorDecisions takeDecisions();
 
   SelectorConfig config_;
-  std::vector<std::set<StampNs>> images_;  ///< raw stamps per camera
-  std::deque<PendingScan> pending_;
+  std::vector<CameraState> cameras_;
+  std::deque<PendingScan> pending_;   ///< oldest first
+  std::set<StampNs> scans_;           ///< first stamps of the last scans
+  std::optional<StampNs> newest_ns_;  ///< of all streams
+  SelectorDecisions decisions_;       ///< made and not yet returned
   SelectorCounters counters_;
 };
 

@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: MIT
+/// From the images of one camera to the semantics that are transferred: superpixels, then share.
+#pragma once
+
+#include <opencv2/core.hpp>
+#include <optional>
+
+#include "semantic_lidar_fusion/config/rig.h"
+#include "semantic_lidar_fusion/superpixel/slic.h"
+#include "semantic_lidar_fusion/superpixel/superpixel_map.h"
+#include "semantic_lidar_fusion/superpixel/uncertainty.h"
+
+namespace semantic_lidar_fusion {
+
+/// Superpixels of one camera's images, in the order in which the images are given. Not thread-safe.
+class CameraSemantics {
+ public:
+  CameraSemantics(const SuperpixelConfig& config, int class_count, const ScoreFormat& format);
+
+  /// Size of the superpixel map of an image: floor(image * scale), at least 1 x 1; without a scale
+  /// the size of the scores, which is empty until scores were seen.
+  std::optional<ImageSize> mapSize(const ImageSize& image) const;
+  /// Tells the size of the scores, for maps of their size. An empty image is ignored.
+  void noteScores(const cv::Mat& scores);
+
+  /// `image`: CV_8UC1 or CV_8UC3 (BGR). Throws DataError.
+  SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size);
+
+  /// `scores` as in ScoreMap. Throws DataError.
+  ShareMap share(const SuperpixelMap& superpixels, const cv::Mat& scores) const;
+
+ private:
+  SuperpixelConfig config_;
+  int class_count_;
+  ScoreFormat format_;
+  std::optional<ImageSize> scores_size_;
+  Slic slic_;
+};
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,52 @@
+// SPDX-License-Identifier: MIT
+#pragma once
+
+#include <cstddef>
+#include <map>
+
+#include "semantic_lidar_fusion/common/types.h"
+
+namespace semantic_lidar_fusion {
+
+/// The values of the newest few stamps. Not thread-safe.
+template <typename T>
+class StampedStore {
+ public:
+  explicit StampedStore(std::size_t capacity) : capacity_(capacity) {}
+
+  /// Replaces the value of a known stamp. Returns the number of values that were pushed out.
+  std::size_t put(StampNs stamp, T value) {
+    values_[stamp] = std::move(value);
+    std::size_t dropped = 0;
+    while (values_.size() > capacity_) {
+      values_.erase(values_.begin());
+      ++dropped;
+    }
+    return dropped;
+  }
+  /// Null if unknown; valid until the next change.
+  const T* find(StampNs stamp) const {
+    const auto found = values_.find(stamp);
+    return found == values_.end() ? nullptr : &found->second;
+  }
+  T* find(StampNs stamp) {
+    const auto found = values_.find(stamp);
+    return found == values_.end() ? nullptr : &found->second;
+  }
+  void erase(StampNs stamp) { values_.erase(stamp); }
+  /// Erases everything older than `stamp`.
+  std::size_t eraseBefore(StampNs stamp) {
+    const std::size_t before = values_.size();
+    values_.erase(values_.begin(), values_.lower_bound(stamp));
+    return before - values_.size();
+  }
+  void clear() { values_.clear(); }
+  std::size_t size() const { return values_.size(); }
+  const std::map<StampNs, T>& values() const { return values_; }
+
+ private:
+  std::size_t capacity_;
+  std::map<StampNs, T> values_;
+};
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,78 @@
+// SPDX-License-Identifier: MIT
+/// A bag that is read: opening it with errors a user understands, and finding topics in it.
+#pragma once
+
+#include <rosbag/bag.h>
+#include <rosbag/view.h>
+#include <std_msgs/Header.h>
+
+#include <cstdint>
+#include <map>
+#include <string>
+#include <vector>
+
+namespace semantic_lidar_fusion {
+
+/// The header of any message that starts with one; the rest is not read.
+struct StampedMessage {
+  std_msgs::Header header;
+};
+
+class BagInput {
+ public:
+  /// Throws Error, one line with path and reason: absent, not a bag, truncated, not indexed.
+  explicit BagInput(const std::string& path);
+
+  const std::string& path() const { return path_; }
+  const rosbag::Bag& bag() const { return bag_; }
+
+  /// Type and number of messages of a topic; a leading slash does not matter.
+  struct Topic {
+    std::string name;  ///< as in the bag
+    std::string datatype;
+    std::uint64_t messages = 0;
+  };
+  /// Null if the bag has no such topic.
+  const Topic* find(const std::string& topic) const;
+  /// "/a, /b (2 more)": the topics of one type; all topics if there is none of it.
+  std::string candidates(const std::string& datatype) const;
+
+ private:
+  std::string path_;
+  rosbag::Bag bag_;
+  std::map<std::string, Topic> topics_;  ///< by name without leading slash
+};
+
+/// Topic names compare without their leading slashes.
+std::string bareTopic(const std::string& topic);
+
+/// One line for a user from what rosbag throws.
+std::string bagErrorText(const std::string& path, const std::exception& error);
+
+}  // namespace semantic_lidar_fusion
+
+namespace ros {
+namespace message_traits {
+template <>
+struct IsMessage<semantic_lidar_fusion::StampedMessage> : TrueType {};
+template <>
+struct MD5Sum<semantic_lidar_fusion::StampedMessage> {
+  static const char* value() { return "*"; }
+  static const char* value(const semantic_lidar_fusion::StampedMessage&) { return value(); }
+};
+template <>
+struct DataType<semantic_lidar_fusion::StampedMessage> {
+  static const char* value() { return "*"; }
+  static const char* value(const semantic_lidar_fusion::StampedMessage&) { return value(); }
+};
+}  // namespace message_traits
+namespace serialization {
+template <>
+struct Serializer<semantic_lidar_fusion::StampedMessage> {
+  template <typename Stream>
+  inline static void read(Stream& stream, semantic_lidar_fusion::StampedMessage& message) {
+    stream.next(message.header);
+  }
+};
+}  // namespace serialization
+}  // namespace ros

@@ -1,0 +1,55 @@
+// SPDX-License-Identifier: MIT
+#include "bag_output.h"
+
+#include <fcntl.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <cstdio>
+#include <cstring>
+
+namespace semantic_lidar_fusion {
+
+BagOutput::BagOutput(const std::string& path, bool overwrite)
+    : path_(path), written_path_(path + ".tmp") {
+  struct stat status {};
+  if (::stat(path.c_str(), &status) == 0) {
+    if (!S_ISREG(status.st_mode)) throw Error(path + ": exists and is not a file");
+    if (!overwrite) throw Error(path + ": exists; give --force to replace it");
+  }
+  bag_ = std::make_unique<rosbag::Bag>();
+  try {
+    bag_->open(written_path_, rosbag::bagmode::Write);
+  } catch (const std::exception& e) {
+    fail(e.what());
+  }
+}
+
+BagOutput::~BagOutput() {
+  if (committed_) return;
+  if (bag_) {
+    try {
+      bag_->close();
+    } catch (const std::exception&) {
+      // The destructor of an open bag writes again, and an exception there ends the program.
+      bag_.release();
+    }
+  }
+  ::unlink(written_path_.c_str());
+}
+
+void BagOutput::commit() {
+  guarded([&] { bag_->close(); });
+  const int file = ::open(written_path_.c_str(), O_RDONLY | O_CLOEXEC);
+  const bool flushed = file >= 0 && ::fsync(file) == 0;
+  const std::string flush_error = flushed ? "" : std::strerror(errno);
+  if (file >= 0) ::close(file);
+  if (!flushed) fail(flush_error);
+  if (std::rename(written_path_.c_str(), path_.c_str()) != 0) fail(std::strerror(errno));
+  committed_ = true;
+}
+
+void BagOutput::fail(const std::string& why) { throw Error(path_ + ": cannot be written: " + why); }
+
+}  // namespace semantic_lidar_fusion

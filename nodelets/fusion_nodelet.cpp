@@ -1,0 +1,153 @@
+// SPDX-License-Identifier: MIT
+#include "fusion_nodelet.h"
+
+#include <ros/master.h>
+
+#include <algorithm>
+#include <string>
+#include <vector>
+
+#include "parameters.h"
+#include "semantic_lidar_fusion/common/error.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+const ros::WallDuration kTickPeriod(0.005);
+const ros::WallDuration kDiagnosticsPeriod(1.0);
+constexpr std::chrono::seconds kReportPeriod{30};
+/// Silence after which the watchdog speaks.
+constexpr std::chrono::seconds kSilence{5};
+
+/// Number of single-letter edits that make b of a (Levenshtein).
+std::size_t editDistance(const std::string& a, const std::string& b) {
+  std::vector<std::size_t> row(b.size() + 1);
+  for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
+  for (std::size_t i = 1; i <= a.size(); ++i) {
+    std::size_t diagonal = row[0];
+    row[0] = i;
+    for (std::size_t j = 1; j <= b.size(); ++j) {
+      const std::size_t above = row[j];
+      row[j] = std::min({row[j] + 1, row[j - 1] + 1, diagonal + (a[i - 1] == b[j - 1] ? 0 : 1)});
+      diagonal = above;
+    }
+  }
+  return row.back();
+}
+
+std::string lastName(const std::string& topic) { return topic.substr(topic.rfind('/') + 1); }
+
+/// "no message on /a/b (1 publisher)", or with the advertised topics that look like it.
+std::string describeSilentTopic(const std::string& topic, const ros::master::V_TopicInfo& topics) {
+  std::string similar;
+  for (const auto& info : topics) {
+    if (info.name == topic) return "no message on " + topic + ", which is advertised";
+    if (lastName(info.name) == lastName(topic) ||
+        editDistance(info.name, topic) <= std::max<std::size_t>(2, topic.size() / 5)) {
+      similar += (similar.empty() ? "" : ", ") + info.name;
+    }
+  }
+  return "no message on " + topic + ", which nobody advertises" +
+         (similar.empty() ? "" : "; advertised similar: " + similar);
+}
+
+}  // namespace
+
+FusionNodelet::~FusionNodelet() {
+  diagnostics_timer_.stop();
+  tick_timer_.stop();
+}
+
+void FusionNodelet::onInit() {
+  try {
+    rig_ = loadRigFromParameters(getPrivateNodeHandle());
+    diagnostics_ = std::make_unique<diagnostic_updater::Updater>(getNodeHandle(),
+                                                                 getPrivateNodeHandle(), getName());
+    diagnostics_->setHardwareID(rig_.name.empty() ? "none" : rig_.name);
+    diagnostics_->add("fusion", [this](diagnostic_updater::DiagnosticStatusWrapper& status) {
+      health_.fill(status);
+    });
+    {
+      // Listeners may connect while publishers are still being set up.
+      std::lock_guard<std::mutex> lock(connect_mutex_);
+      initialize();
+      initialized_ = true;
+      updateSubscriptions();
+    }
+    // Wall time: ROS timers stand still while /clock is silent, which is one thing to report.
+    diagnostics_timer_ = getMTNodeHandle().createWallTimer(
+        kDiagnosticsPeriod,
+        [this](const ros::WallTimerEvent&) { guard("watchdog", [this] { watch(); }); });
+  } catch (const ConfigError& problem) {
+    NODELET_FATAL_STREAM(problem.what());
+  } catch (const std::exception& problem) {
+    NODELET_FATAL_STREAM("cannot start: " << problem.what());
+  }
+}
+
+void FusionNodelet::startTicking() {
+  tick_timer_ = getNodeHandle().createWallTimer(
+      kTickPeriod, [this](const ros::WallTimerEvent&) { guard("tick", [this] { tick(now()); }); });
+}
+
+StampNs FusionNodelet::now() const {
+  if (ros::Time::isSimTime()) return static_cast<StampNs>(ros::Time::now().toNSec());
+  return static_cast<StampNs>(ros::SteadyTime::now().toNSec());
+}
+
+void FusionNodelet::guard(const std::string& where, const std::function<void()>& work) {
+  try {
+    work();
+  } catch (const std::exception& problem) {
+    health_.count("dropped: error in " + where);
+    error(where, where + ": " + problem.what());
+  } catch (...) {
+    health_.count("dropped: error in " + where);
+    error(where, where + ": unknown exception");
+  }
+}
+
+bool FusionNodelet::mayReport(const std::string& key) {
+  std::lock_guard<std::mutex> lock(report_mutex_);
+  const auto now = Health::Clock::now();
+  const auto [entry, first] = reported_.emplace(key, now);
+  if (!first && now - entry->second < kReportPeriod) return false;
+  entry->second = now;
+  return true;
+}
+
+void FusionNodelet::warn(const std::string& key, const std::string& text) {
+  if (mayReport(key)) NODELET_WARN_STREAM(text);
+}
+
+void FusionNodelet::error(const std::string& key, const std::string& text) {
+  health_.error(text);
+  if (mayReport(key)) NODELET_ERROR_STREAM(text);
+}
+
+void FusionNodelet::watch() {
+  diagnostics_->force_update();
+  const auto now = Health::Clock::now();
+  if (now - started_ < kSilence || now - watched_ < kSilence || health_.publishedWithin(kSilence)) {
+    return;
+  }
+  watched_ = now;
+  if (ros::Time::isSimTime() && ros::Time::now().isZero()) {
+    warn("clock", "use_sim_time is true but /clock is silent; play with --clock");
+    return;
+  }
+  const std::vector<std::string> silent = health_.silentInputs(kSilence);
+  std::string reasons;
+  if (!silent.empty()) {
+    ros::master::V_TopicInfo topics;
+    ros::master::getTopics(topics);
+    for (const auto& topic : silent) {
+      reasons += (reasons.empty() ? "" : "; ") + describeSilentTopic(topic, topics);
+    }
+  }
+  const std::string explanation = explainSilence();
+  if (!explanation.empty()) reasons += (reasons.empty() ? "" : "; ") + explanation;
+  if (!reasons.empty()) warn("silence", "nothing published for 5 s: " + reasons);
+}
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,123 @@
+// SPDX-License-Identifier: MIT
+/// What all nodelets of this package share: loading the rig, one catch-all boundary around every
+/// callback, lazy subscriptions, throttled reports, diagnostics, and a watchdog that says why
+/// nothing is published.
+///
+/// Threads: callbacks given to `subscribe` with getNodeHandle() run one at a time; timers of this
+/// class run on the multi-threaded queue, hold no lock while they ask the master, and touch only
+/// Health, which locks for itself.
+#pragma once
+
+#include <diagnostic_updater/diagnostic_updater.h>
+#include <nodelet/nodelet.h>
+#include <ros/ros.h>
+
+#include <atomic>
+#include <exception>
+#include <functional>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <string>
+
+#include "health.h"
+#include "semantic_lidar_fusion/config/rig.h"
+
+namespace semantic_lidar_fusion {
+
+class FusionNodelet : public nodelet::Nodelet {
+ public:
+  ~FusionNodelet() override;
+
+ protected:
+  /// Sets up publishers, then subscribers; runs inside the boundary. A ConfigError ends the
+  /// nodelet's life: it is reported once and nothing is subscribed.
+  virtual void initialize() = 0;
+  /// Demand has changed: subscribe on the first listener, shut down on the last. Called with
+  /// `connectMutex` held.
+  virtual void updateSubscriptions() {}
+  /// A clock jump was seen: forget buffered data.
+  virtual void startEpoch(const std::string& /*why*/) {}
+  /// What is missing, in words, when nothing was published for a while; empty = nothing to say.
+  virtual std::string explainSilence() { return {}; }
+  /// Called every `kTickPeriod` with now(), one at a time with the callbacks of getNodeHandle().
+  virtual void tick(StampNs /*now_ns*/) {}
+  /// Asks for `tick`; call in initialize.
+  void startTicking();
+
+  const Rig& rig() const { return rig_; }
+  Health& health() { return health_; }
+  std::mutex& connectMutex() { return connect_mutex_; }
+
+  /// The clock of deadlines: ROS time in simulation, else steady time.
+  StampNs now() const;
+
+  /// Runs `work`; no exception leaves. Errors are counted, reported (throttled) and shown.
+  void guard(const std::string& where, const std::function<void()>& work);
+
+  /// Subscribes a member function: counted, guarded, without Nagle's delay. `queue_size` > 0.
+  template <class M, class T>
+  ros::Subscriber subscribe(ros::NodeHandle& handle, const std::string& topic, int queue_size,
+                            void (T::*callback)(const boost::shared_ptr<const M>&)) {
+    T* self = static_cast<T*>(this);
+    return subscribe<M>(handle, topic, queue_size,
+                        [self, callback](const boost::shared_ptr<const M>& message) {
+                          (self->*callback)(message);
+                        });
+  }
+  template <class M>
+  ros::Subscriber subscribe(
+      ros::NodeHandle& handle, const std::string& topic, int queue_size,
+      const std::function<void(const boost::shared_ptr<const M>&)>& callback) {
+    const std::string resolved = handle.resolveName(topic);
+    health_.expectInput(resolved);
+    const boost::function<void(const boost::shared_ptr<const M>&)> guarded =
+        [this, resolved, callback](const boost::shared_ptr<const M>& message) {
+          health_.received(resolved);
+          guard(resolved, [&] { callback(message); });
+        };
+    return handle.subscribe<M>(topic, static_cast<uint32_t>(queue_size), guarded,
+                               ros::VoidConstPtr(), ros::TransportHints().tcpNoDelay());
+  }
+
+  /// Advertises a topic whose first listener and last farewell call updateSubscriptions.
+  template <class M>
+  ros::Publisher advertise(ros::NodeHandle& handle, const std::string& topic, int queue_size) {
+    const ros::SubscriberStatusCallback changed = [this](const ros::SingleSubscriberPublisher&) {
+      guard("connection", [this] {
+        std::lock_guard<std::mutex> lock(connect_mutex_);
+        if (initialized_) updateSubscriptions();
+      });
+    };
+    return handle.advertise<M>(topic, static_cast<uint32_t>(queue_size), changed, changed);
+  }
+
+  /// Publishes by pointer and counts; the message must not be touched afterwards.
+  template <class M>
+  void publish(const ros::Publisher& publisher, const boost::shared_ptr<M>& message) {
+    publisher.publish(message);
+    health_.published(publisher.getTopic());
+  }
+
+  /// Reports at once, then at most every 30 s for the same `key`.
+  void warn(const std::string& key, const std::string& text);
+  void error(const std::string& key, const std::string& text);
+
+ private:
+  void onInit() final;
+  bool mayReport(const std::string& key);
+  void watch();
+
+  Rig rig_;
+  Health health_;
+  std::mutex connect_mutex_;
+  bool initialized_ = false;  ///< guarded by connect_mutex_
+  std::mutex report_mutex_;
+  std::map<std::string, Health::Clock::time_point> reported_;
+  Health::Clock::time_point started_ = Health::Clock::now();
+  Health::Clock::time_point watched_ = started_;
+  std::unique_ptr<diagnostic_updater::Updater> diagnostics_;
+  ros::WallTimer diagnostics_timer_, tick_timer_;
+};
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,292 @@
+// SPDX-License-Identifier: MIT
+/// Stamps of scans and images -> t_ref of each scan and one image per camera, published as the
+/// messages that came in. All callbacks run one at a time.
+#include <memory>
+#include <optional>
+#include <pluginlib/class_list_macros.hpp>
+#include <string>
+#include <vector>
+
+#include "camera_geometry.h"
+#include "conversions.h"
+#include "fusion_chain.h"
+#include "fusion_nodelet.h"
+#include "lidar_decoder.h"
+#include "semantic_lidar_fusion/sync/epoch_monitor.h"
+#include "semantic_lidar_fusion/sync/scan_selector.h"
+#include "semantic_lidar_fusion/sync/stamped_store.h"
+#include "tf_subscription.h"
+#include "topics.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+/// Images kept per camera until no scan can choose them any more: 2 s at 30 Hz.
+constexpr std::size_t kMaxImages = 64;
+constexpr std::size_t kMaxImageBytes = 512u << 20;
+constexpr std::size_t kKnownStamps = 64;
+
+}  // namespace
+
+class ImageSelectionNodelet : public FusionNodelet {
+ private:
+  struct Image {
+    sensor_msgs::ImageConstPtr raw;
+    sensor_msgs::CompressedImageConstPtr compressed;
+    std::size_t bytes() const { return raw ? raw->data.size() : compressed->data.size(); }
+  };
+  struct Camera {
+    explicit Camera(const CameraConfig& config) : config(config), geometry(config) {}
+
+    const CameraConfig& config;
+    CameraGeometry geometry;  ///< for closest_to_sweep
+    StampedStore<Image> images{kMaxImages};
+    StampedStore<bool> semantics{kKnownStamps};  ///< free-running network: stamps with scores
+    StampedStore<bool> sent{kKnownStamps};       ///< images that are published
+    ros::Publisher selection, image_selected;
+    ros::Subscriber images_subscriber, semantics_subscriber, info_subscriber;
+  };
+
+  void initialize() override {
+    selector_ = std::make_unique<ScanSelector>(rig().selectorConfig());
+    // The motion nodelet decodes the same messages, and counts.
+    lidar_ = std::make_unique<LidarDecoder>(rig().lidar, [](const std::string&, std::uint64_t) {});
+    sweep_ = rig().image_choice == ImageChoice::kClosestToSweep;
+    if (sweep_) tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
+    reference_ = advertise<sensor_msgs::TimeReference>(getNodeHandle(), "scan_reference", 16);
+    for (const CameraConfig& config : rig().cameras) {
+      cameras_.push_back(std::make_unique<Camera>(config));
+      Camera& camera = *cameras_.back();
+      camera.selection = advertise<sensor_msgs::TimeReference>(
+          getNodeHandle(), cameraTopic(config, "selection"), 16);
+      camera.image_selected =
+          advertise<sensor_msgs::Image>(getNodeHandle(), cameraTopic(config, "image_selected"), 4);
+    }
+    startTicking();
+  }
+
+  void updateSubscriptions() override {
+    bool wanted = reference_.getNumSubscribers() > 0;
+    for (const auto& camera : cameras_) {
+      wanted = wanted || camera->selection.getNumSubscribers() > 0 ||
+               camera->image_selected.getNumSubscribers() > 0;
+    }
+    if (wanted == static_cast<bool>(lidar_subscriber_)) return;
+    if (!wanted) {
+      lidar_subscriber_.shutdown();
+      for (const auto& camera : cameras_) {
+        camera->images_subscriber.shutdown();
+        camera->semantics_subscriber.shutdown();
+        camera->info_subscriber.shutdown();
+      }
+      return;
+    }
+    for (std::size_t i = 0; i < cameras_.size(); ++i) subscribeCamera(static_cast<int>(i));
+    lidar_subscriber_ = rig().lidar.input == LidarInput::kPackets
+                            ? subscribe<VelodyneScan>(getNodeHandle(), rig().lidar.topic, 8,
+                                                      &ImageSelectionNodelet::onScan<VelodyneScan>)
+                            : subscribe<sensor_msgs::PointCloud2>(
+                                  getNodeHandle(), rig().lidar.topic, 8,
+                                  &ImageSelectionNodelet::onScan<sensor_msgs::PointCloud2>);
+  }
+
+  void subscribeCamera(int index) {
+    Camera& camera = *cameras_[static_cast<std::size_t>(index)];
+    const CameraConfig& config = camera.config;
+    if (config.transport == ImageTransport::kCompressed) {
+      camera.images_subscriber = subscribe<sensor_msgs::CompressedImage>(
+          getNodeHandle(), imageTopic(config), 8,
+          [this, index](const sensor_msgs::CompressedImageConstPtr& image) {
+            onImage(index, {nullptr, image}, stampNs(image->header.stamp));
+          });
+    } else {
+      camera.images_subscriber = subscribe<sensor_msgs::Image>(
+          getNodeHandle(), imageTopic(config), 8,
+          [this, index](const sensor_msgs::ImageConstPtr& image) {
+            onImage(index, {image, nullptr}, stampNs(image->header.stamp));
+          });
+    }
+    if (candidatesNeedSemantics()) {
+      camera.semantics_subscriber = subscribe<sensor_msgs::Image>(
+          getNodeHandle(), semanticsTopic(rig(), config), 8,
+          [this, index](const sensor_msgs::ImageConstPtr& scores) { onSemantics(index, *scores); });
+    }
+    if (sweep_) {
+      camera.info_subscriber = subscribe<sensor_msgs::CameraInfo>(
+          getNodeHandle(), inputTopic(config, config.camera_info), 8,
+          [&camera](const sensor_msgs::CameraInfoConstPtr& info) {
+            camera.geometry.update(*info);
+          });
+    }
+  }
+
+  /// A free-running network of another node: only images whose scores have arrived can be chosen.
+  bool candidatesNeedSemantics() const {
+    return rig().segmentation.mode == SegmentationMode::kFreeRunning &&
+           rig().segmentation.model.empty();
+  }
+
+  void onImage(int index, const Image& image, StampNs stamp) {
+    Camera& camera = *cameras_[static_cast<std::size_t>(index)];
+    if (!usable(imageTopic(camera.config), stamp)) return;
+    camera.images.put(stamp, image);
+    trim(&camera);
+    if (!candidatesNeedSemantics() || camera.semantics.find(stamp) != nullptr) {
+      selector_->addImage(index, stamp);
+      decide();
+    }
+  }
+
+  void onSemantics(int index, const sensor_msgs::Image& scores) {
+    Camera& camera = *cameras_[static_cast<std::size_t>(index)];
+    const StampNs stamp = stampNs(scores.header.stamp);
+    if (scores.data.empty() || !usable(semanticsTopic(rig(), camera.config), stamp)) return;
+    camera.semantics.put(stamp, true);
+    if (camera.images.find(stamp) != nullptr) {
+      selector_->addImage(index, stamp);
+      decide();
+    }
+  }
+
+  /// Old images make room, by number (StampedStore) and by bytes.
+  static void trim(Camera* camera) {
+    std::size_t bytes = 0;
+    for (const auto& [stamp, image] : camera->images.values()) bytes += image.bytes();
+    while (bytes > kMaxImageBytes && camera->images.size() > 1) {
+      const auto oldest = camera->images.values().begin();
+      bytes -= oldest->second.bytes();
+      camera->images.erase(oldest->first);
+    }
+  }
+
+  template <class M>
+  void onScan(const boost::shared_ptr<const M>& message) {
+    SelectorScan scan;
+    {
+      const StageTimer timer(health(), "decode");
+      const TimedCloud cloud = lidar_->decode(*message);
+      if (cloud.empty()) {
+        health().count("empty scans");
+        return;
+      }
+      scan.interval = scanInterval(cloud);
+      if (!usable(rig().lidar.topic, scan.interval.first_ns)) return;
+      if (sweep_) scan.sweep_ns = sweepTimes(cloud);
+    }
+    selector_->addScan(scan, now());
+    decide();
+  }
+
+  std::vector<std::optional<StampNs>> sweepTimes(const TimedCloud& cloud) {
+    std::vector<std::optional<StampNs>> times;
+    for (const auto& camera : cameras_) {
+      times.emplace_back();
+      if (!camera->geometry.model()) continue;
+      const TransformAnswer T_camera_lidar =
+          tf_->source().extrinsics(camera->geometry.frame(), cloud.frame_id);
+      if (!T_camera_lidar) {
+        warn("extrinsics " + camera->config.name, T_camera_lidar.message);
+        continue;
+      }
+      times.back() = sweepTime(cloud, {camera->geometry.model(), *T_camera_lidar.transform});
+    }
+    return times;
+  }
+
+  /// False for a stamp that cannot be used; starts anew after a clock jump.
+  bool usable(const std::string& topic, StampNs stamp) {
+    if (stamp == 0) {
+      health().count("dropped: stamp 0 on " + topic);
+      error("stamp " + topic, topic + ": header.stamp is 0; it must be the time of measurement");
+      return false;
+    }
+    switch (epoch_.observe(topic, stamp)) {
+      case StampVerdict::kCurrent:
+        return true;
+      case StampVerdict::kStale:
+        health().count("dropped: " + topic + " from before a clock jump");
+        return false;
+      case StampVerdict::kNewEpoch:
+        health().count("clock jumps");
+        NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
+        selector_->reset();
+        for (const auto& camera : cameras_) {
+          camera->images.clear();
+          camera->semantics.clear();
+          camera->sent.clear();
+        }
+        return true;
+    }
+    return true;
+  }
+
+  void tick(StampNs /*now_ns*/) override { decide(); }
+
+  void decide() {
+    const SelectorDecisions decisions = selector_->advance(now());
+    for (const ReferenceDecision& decision : decisions.references) {
+      if (decision.timed_out) {
+        health().count("t_ref is the middle of the scan: no reference image in time");
+      }
+      publish(reference_, boost::make_shared<sensor_msgs::TimeReference>(
+                              scanReferenceMessage(decision.scan_ns, decision.reference_ns)));
+    }
+    for (const SelectionDecision& decision : decisions.selections) publishSelection(decision);
+    const SelectorCounters& counters = selector_->counters();
+    const std::uint64_t overflow = counters.scans_dropped_pending;
+    if (overflow > reported_overflow_) {
+      health().count("dropped: scan, too many wait for images", overflow - reported_overflow_);
+      reported_overflow_ = overflow;
+      warn("overflow", "a scan is dropped: too many wait for images");
+    }
+    health().set("pending scans", std::to_string(selector_->pendingScans()));
+  }
+
+  void publishSelection(const SelectionDecision& decision) {
+    Camera& camera = *cameras_[static_cast<std::size_t>(decision.camera)];
+    const std::string& name = camera.config.name;
+    if (!decision.image_stamp) {
+      health().count(name + (decision.timed_out ? ": no image, timed out" : ": no image in time"));
+    }
+    publish(camera.selection, boost::make_shared<sensor_msgs::TimeReference>(
+                                  selectionMessage(decision.scan_ns, decision.image_stamp, name)));
+    if (!decision.image_stamp || camera.sent.find(*decision.image_stamp) != nullptr ||
+        camera.image_selected.getNumSubscribers() == 0) {
+      return;
+    }
+    const Image* image = camera.images.find(*decision.image_stamp);
+    if (image == nullptr) {
+      health().count("dropped: " + name + " image left the buffer before it was chosen");
+      return;
+    }
+    camera.sent.put(*decision.image_stamp, true);
+    guard(imageTopic(camera.config), [&] {
+      if (image->raw) {
+        camera.image_selected.publish(image->raw);
+        health().published(camera.image_selected.getTopic());
+      } else {
+        const StageTimer timer(health(), "decompression");
+        publish(camera.image_selected,
+                imageMessage(decodedImage(*image->compressed), image->compressed->header));
+      }
+    });
+  }
+
+  std::string explainSilence() override {
+    return lidar_subscriber_ ? "" : "nobody listens to " + reference_.getTopic();
+  }
+
+  std::unique_ptr<ScanSelector> selector_;
+  std::unique_ptr<LidarDecoder> lidar_;
+  std::unique_ptr<TfSubscription> tf_;
+  bool sweep_ = false;
+  EpochMonitor epoch_;
+  std::vector<std::unique_ptr<Camera>> cameras_;
+  std::uint64_t reported_overflow_ = 0;
+  ros::Publisher reference_;
+  ros::Subscriber lidar_subscriber_;
+};
+
+}  // namespace semantic_lidar_fusion
+
+PLUGINLIB_EXPORT_CLASS(semantic_lidar_fusion::ImageSelectionNodelet, nodelet::Nodelet)

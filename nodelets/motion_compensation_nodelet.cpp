@@ -1,0 +1,214 @@
+// SPDX-License-Identifier: MIT
+/// Lidar scans -> one rigid cloud for each, as seen from the lidar's pose at t_ref.
+///
+/// A scan waits until t_ref is known and odometry covers the scan and t_ref, or until the timeout;
+/// then what odometry does not cover is treated as `odometry.on_missing` says. Scans leave in
+/// order. All callbacks run one at a time.
+#include <algorithm>
+#include <deque>
+#include <memory>
+#include <optional>
+#include <pluginlib/class_list_macros.hpp>
+#include <string>
+#include <utility>
+
+#include "conversions.h"
+#include "fusion_nodelet.h"
+#include "lidar_decoder.h"
+#include "semantic_lidar_fusion/motion/compensation.h"
+#include "semantic_lidar_fusion/sync/epoch_monitor.h"
+#include "semantic_lidar_fusion/sync/stamped_store.h"
+#include "tf_subscription.h"
+#include "topics.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+constexpr std::size_t kMaxPendingScans = 4;
+constexpr std::size_t kKnownReferences = 32;
+constexpr StampNs kReferenceGraceNs = 500000000;
+
+}  // namespace
+
+class MotionCompensationNodelet : public FusionNodelet {
+ private:
+  struct Scan {
+    TimedCloud cloud;
+    ScanInterval interval;
+    StampNs arrived_ns = 0;
+  };
+  struct Reference {
+    StampNs reference_ns = 0;
+    StampNs arrived_ns = 0;
+  };
+
+  void initialize() override {
+    lidar_ = std::make_unique<LidarDecoder>(rig().lidar,
+                                            [this](const std::string& reason, std::uint64_t count) {
+                                              health().count("dropped: " + reason, count);
+                                            });
+    // The selection nodelet settles t_ref within its own timeout; the rest is grace for its thread.
+    longest_reference_wait_ns_ = toNs(rig().reference.timeout_s) + kReferenceGraceNs;
+    tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
+    output_ = advertise<sensor_msgs::PointCloud2>(getNodeHandle(), "points_compensated", 4);
+    startTicking();
+  }
+
+  void updateSubscriptions() override {
+    const bool wanted = output_.getNumSubscribers() > 0;
+    if (wanted && !references_subscriber_) {
+      references_subscriber_ = subscribe<sensor_msgs::TimeReference>(
+          getNodeHandle(), "scan_reference", 16, &MotionCompensationNodelet::onReference);
+      lidar_subscriber_ =
+          rig().lidar.input == LidarInput::kPackets
+              ? subscribe<VelodyneScan>(getNodeHandle(), rig().lidar.topic, 8,
+                                        &MotionCompensationNodelet::onScan<VelodyneScan>)
+              : subscribe<sensor_msgs::PointCloud2>(
+                    getNodeHandle(), rig().lidar.topic, 8,
+                    &MotionCompensationNodelet::onScan<sensor_msgs::PointCloud2>);
+    } else if (!wanted && references_subscriber_) {
+      references_subscriber_.shutdown();
+      lidar_subscriber_.shutdown();
+    }
+  }
+
+  template <class M>
+  void onScan(const boost::shared_ptr<const M>& message) {
+    Scan scan;
+    {
+      const StageTimer timer(health(), "decode");
+      scan.cloud = lidar_->decode(*message);
+    }
+    reportTimeDecision();
+    scan.interval = scanInterval(scan.cloud);
+    scan.arrived_ns = now();
+    if (!current("lidar", scan.interval.first_ns)) return;
+    pending_.push_back(std::move(scan));
+    if (pending_.size() > kMaxPendingScans) {
+      pending_.pop_front();
+      health().count("dropped: scan, too many wait for odometry or scan_reference");
+      warn("pending", "a scan is dropped: " + std::to_string(kMaxPendingScans) +
+                          " others wait for odometry or scan_reference");
+    }
+    release();
+  }
+
+  /// Tells once how the times of the points are understood.
+  void reportTimeDecision() {
+    if (lidar_->timeDecision() == told_time_decision_) return;
+    told_time_decision_ = lidar_->timeDecision();
+    if (lidar_->timeDecisionIsDoubtful()) {
+      NODELET_WARN_STREAM(rig().lidar.topic << ": " << told_time_decision_);
+    } else {
+      NODELET_INFO_STREAM(rig().lidar.topic << ": " << told_time_decision_);
+    }
+    health().set("point times", told_time_decision_);
+  }
+
+  void onReference(const sensor_msgs::TimeReferenceConstPtr& message) {
+    const StampNs scan_ns = stampNs(message->header.stamp);
+    if (!current("scan_reference", scan_ns)) return;
+    references_.put(scan_ns, {stampNs(message->time_ref), now()});
+    release();
+  }
+
+  void tick(StampNs /*now_ns*/) override { release(); }
+
+  /// False for what is from before a clock jump; forgets what is pending after one.
+  bool current(const std::string& source, StampNs stamp) {
+    const StampVerdict verdict = epoch_.observe(source, stamp);
+    if (verdict == StampVerdict::kNewEpoch) {
+      health().count("clock jumps");
+      health().count("dropped: scan pending at a clock jump", pending_.size());
+      pending_.clear();
+      references_.clear();
+      tf_->source().clear();
+      NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
+    }
+    if (verdict == StampVerdict::kStale) {
+      health().count("dropped: " + source + " from before a clock jump");
+    }
+    return verdict != StampVerdict::kStale;
+  }
+
+  /// Publishes the scans at the front of the queue that need not wait any longer.
+  void release() {
+    while (!pending_.empty()) {
+      const Scan& scan = pending_.front();
+      if (scan.cloud.empty()) {
+        Cloud empty;
+        empty.frame_id = scan.cloud.frame_id;
+        empty.stamp = empty.first_point_ns = scan.cloud.header_stamp;
+        health().count("empty scans");
+        publish(output_, compensatedCloudMessage(empty));
+        pending_.pop_front();
+        continue;
+      }
+      const Reference* reference = references_.find(scan.interval.first_ns);
+      if (reference == nullptr) {
+        if (now() - scan.arrived_ns < longest_reference_wait_ns_) return;
+        health().count("dropped: scan without scan_reference");
+        warn("reference",
+             "a scan is dropped: no scan_reference for its first point in " +
+                 std::to_string(toSeconds(longest_reference_wait_ns_)) +
+                 " s; is the selection nodelet fed with the same lidar topic and rig?");
+        pending_.pop_front();
+        continue;
+      }
+      const StampNs t_ref = reference->reference_ns;
+      const StampNs from_ns = std::min(scan.interval.first_ns, t_ref);
+      const StampNs to_ns = std::max(scan.interval.last_ns, t_ref);
+      const std::string gap = rig().motion_enabled ? tf_->source().gap(from_ns, to_ns) : "";
+      const TransformAnswer T_vehicle_lidar =
+          tf_->source().extrinsics(rig().vehicle_frame, scan.cloud.frame_id);
+      const bool complete = gap.empty() && (T_vehicle_lidar || !rig().motion_enabled);
+      const StampNs waited_since = std::max(scan.arrived_ns, reference->arrived_ns);
+      if (!complete && now() - waited_since < toNs(rig().odometry.timeout_s)) return;
+      if (!complete) {
+        health().count("odometry timeouts");
+        warn("odometry", "scan without full odometry after " +
+                             std::to_string(rig().odometry.timeout_s) +
+                             " s: " + (T_vehicle_lidar ? gap : T_vehicle_lidar.message));
+      }
+      publishCompensated(scan, t_ref, T_vehicle_lidar);
+      pending_.pop_front();
+    }
+  }
+
+  void publishCompensated(const Scan& scan, StampNs t_ref, const TransformAnswer& T_vehicle_lidar) {
+    CompensationResult result;
+    {
+      const StageTimer timer(health(), "compensation");
+      // Without extrinsics no pose of the lidar is known: the same as no odometry.
+      static const PoseBuffer kNoOdometry;
+      result = compensate(
+          scan.cloud, t_ref, T_vehicle_lidar ? tf_->source().odometry() : kNoOdometry,
+          T_vehicle_lidar.transform.value_or(Transform::Identity()), rig().compensationConfig());
+    }
+    const CompensationCounters& counters = result.counters;
+    health().count("points", result.cloud.size());
+    health().count("points without odometry: marked", counters.marked_points);
+    health().count("points without odometry: dropped", counters.dropped_points);
+    health().count("points without odometry: pose held", counters.held_points);
+    health().count("points without odometry: pose extrapolated", counters.extrapolated_points);
+    publish(output_, compensatedCloudMessage(result.cloud));
+  }
+
+  std::string explainSilence() override {
+    return output_.getNumSubscribers() == 0 ? "nobody listens to " + output_.getTopic() : "";
+  }
+
+  std::unique_ptr<LidarDecoder> lidar_;
+  std::string told_time_decision_;
+  std::unique_ptr<TfSubscription> tf_;
+  EpochMonitor epoch_;
+  StampedStore<Reference> references_{kKnownReferences};
+  std::deque<Scan> pending_;
+  StampNs longest_reference_wait_ns_ = 0;
+  ros::Publisher output_;
+  ros::Subscriber references_subscriber_, lidar_subscriber_;
+};
+
+}  // namespace semantic_lidar_fusion
+
+PLUGINLIB_EXPORT_CLASS(semantic_lidar_fusion::MotionCompensationNodelet, nodelet::Nodelet)

@@ -1,0 +1,354 @@
+// SPDX-License-Identifier: MIT
+/// Compensated clouds and the semantics of the selected images -> the semantic cloud.
+///
+/// Scans wait in a FusionQueue until each camera is ready, has no image, or is late. All callbacks
+/// run one at a time.
+#include <algorithm>
+#include <memory>
+#include <optional>
+#include <pluginlib/class_list_macros.hpp>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "camera_geometry.h"
+#include "conversions.h"
+#include "fusion_chain.h"
+#include "fusion_nodelet.h"
+#include "semantic_lidar_fusion/overlay/overlay.h"
+#include "semantic_lidar_fusion/sync/epoch_monitor.h"
+#include "semantic_lidar_fusion/sync/fusion_queue.h"
+#include "semantic_lidar_fusion/sync/stamped_store.h"
+#include "tf_subscription.h"
+#include "topics.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+/// Images whose semantics are kept per camera: one image can serve two scans.
+constexpr std::size_t kKeptImages = 12;
+
+}  // namespace
+
+class ProjectionNodelet : public FusionNodelet {
+ private:
+  /// The parts of one image's semantics, as they come.
+  struct Semantics {
+    sensor_msgs::ImageConstPtr scores, share, probabilities;
+    bool announced = false;  ///< told to the queue
+  };
+  struct Camera {
+    Camera(const CameraConfig& config, int index)
+        : config(config), index(index), geometry(config) {}
+
+    const CameraConfig& config;
+    int index;  ///< in the rig file
+    CameraGeometry geometry;
+    StampedStore<Semantics> semantics{kKeptImages};
+    StampedStore<sensor_msgs::ImageConstPtr> images{kKeptImages};  ///< for the overlay
+    ros::Publisher overlay;
+    ros::Subscriber info, selection, scores, share, probabilities, image;
+  };
+
+  void initialize() override {
+    chain_ = std::make_unique<FusionChain>(rig());
+
+    FusionQueueConfig queue;
+    for (const CameraConfig& camera : rig().cameras)
+      queue.timeout_ns.push_back(toNs(camera.timeout_s));
+    queue_ = std::make_unique<FusionQueue>(queue);
+    tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
+
+    class_info_ = getNodeHandle().advertise<std_msgs::String>("class_info", 1, true);
+    class_info_.publish(classInfoMessage(rig().classes));
+    output_ = advertise<sensor_msgs::PointCloud2>(getNodeHandle(), "points_semantic", 4);
+    for (std::size_t i = 0; i < rig().cameras.size(); ++i) {
+      cameras_.push_back(std::make_unique<Camera>(rig().cameras[i], static_cast<int>(i)));
+      Camera& camera = *cameras_.back();
+      camera.overlay = advertise<sensor_msgs::Image>(
+          getNodeHandle(), cameraTopic(camera.config, "projection_overlay"), 2);
+      // Camera_info is read from the start: it may be latched, or come only once.
+      camera.info = subscribe<sensor_msgs::CameraInfo>(
+          getNodeHandle(), inputTopic(camera.config, camera.config.camera_info), 8,
+          [&camera](const sensor_msgs::CameraInfoConstPtr& info) {
+            camera.geometry.update(*info);
+          });
+    }
+    startTicking();
+  }
+
+  void updateSubscriptions() override {
+    bool wanted = output_.getNumSubscribers() > 0;
+    for (const auto& camera : cameras_) wanted = wanted || camera->overlay.getNumSubscribers() > 0;
+    for (const auto& camera : cameras_) updateCamera(wanted, camera.get());
+    if (wanted && !cloud_subscriber_) {
+      reference_subscriber_ = subscribe<sensor_msgs::TimeReference>(
+          getNodeHandle(), "scan_reference", 16, &ProjectionNodelet::onReference);
+      cloud_subscriber_ = subscribe<sensor_msgs::PointCloud2>(getNodeHandle(), "points_compensated",
+                                                              8, &ProjectionNodelet::onCloud);
+    } else if (!wanted && cloud_subscriber_) {
+      reference_subscriber_.shutdown();
+      cloud_subscriber_.shutdown();
+    }
+  }
+
+  void updateCamera(bool wanted, Camera* camera) {
+    const CameraConfig& config = camera->config;
+    const auto images =
+        [&](bool needed, const std::string& topic, ros::Subscriber* subscriber,
+            void (ProjectionNodelet::*callback)(Camera*, const sensor_msgs::ImageConstPtr&)) {
+          if (needed && !*subscriber) {
+            *subscriber = subscribe<sensor_msgs::Image>(
+                getNodeHandle(), topic, 8,
+                [this, camera, callback](const sensor_msgs::ImageConstPtr& message) {
+                  (this->*callback)(camera, message);
+                });
+          } else if (!needed && *subscriber) {
+            subscriber->shutdown();
+          }
+        };
+    if (wanted && !camera->selection) {
+      camera->selection = subscribe<sensor_msgs::TimeReference>(
+          getNodeHandle(), cameraTopic(config, "selection"), 16,
+          [this, camera](const sensor_msgs::TimeReferenceConstPtr& message) {
+            onSelection(camera, *message);
+          });
+    } else if (!wanted && camera->selection) {
+      camera->selection.shutdown();
+    }
+    const bool scores = config.input == CameraInput::kScores;
+    images(wanted && scores, semanticsTopic(rig(), config), &camera->scores,
+           &ProjectionNodelet::onScores);
+    images(wanted && scores, cameraTopic(config, "share"), &camera->share,
+           &ProjectionNodelet::onShare);
+    // Labels become probabilities in the superpixel nodelet; probabilities come from another node.
+    images(wanted && !scores,
+           config.input == CameraInput::kLabels ? cameraTopic(config, "probabilities")
+                                                : semanticsTopic(rig(), config),
+           &camera->probabilities, &ProjectionNodelet::onProbabilities);
+    images(wanted && camera->overlay.getNumSubscribers() > 0, cameraTopic(config, "image_selected"),
+           &camera->image, &ProjectionNodelet::onImage);
+  }
+
+  // --- Inputs
+
+  void onReference(const sensor_msgs::TimeReferenceConstPtr& message) {
+    const StampNs scan_ns = stampNs(message->header.stamp);
+    if (!current("scan_reference", scan_ns)) return;
+    queue_->addReference(scan_ns, stampNs(message->time_ref));
+    fuseComplete();
+  }
+
+  void onSelection(Camera* camera, const sensor_msgs::TimeReference& message) {
+    const StampNs scan_ns = stampNs(message.header.stamp);
+    if (!current(camera->config.name + " selection", scan_ns)) return;
+    const StampNs image_stamp = stampNs(message.time_ref);
+    queue_->addSelection(scan_ns, camera->index,
+                         image_stamp == 0 ? std::nullopt : std::make_optional(image_stamp));
+    fuseComplete();
+  }
+
+  void onCloud(const sensor_msgs::PointCloud2ConstPtr& message) {
+    const auto cloud = std::make_shared<const Cloud>(compensatedCloud(*message));
+    if (!current("points_compensated", cloud->stamp)) return;
+    const std::uint64_t dropped_before = queue_->droppedPending();
+    queue_->addCloud(cloud, now());
+    if (queue_->droppedPending() > dropped_before) {
+      health().count("dropped: scan, too many wait for cameras");
+      warn("pending", "a scan is dropped: too many others wait for cameras");
+    }
+    fuseComplete();
+  }
+
+  void onScores(Camera* camera, const sensor_msgs::ImageConstPtr& message) {
+    addSemantics(camera, "scores", message, &Semantics::scores);
+  }
+  void onShare(Camera* camera, const sensor_msgs::ImageConstPtr& message) {
+    addSemantics(camera, "share", message, &Semantics::share);
+  }
+  void onProbabilities(Camera* camera, const sensor_msgs::ImageConstPtr& message) {
+    addSemantics(camera, "probabilities", message, &Semantics::probabilities);
+  }
+
+  void addSemantics(Camera* camera, const std::string& source,
+                    const sensor_msgs::ImageConstPtr& message,
+                    sensor_msgs::ImageConstPtr Semantics::*part) {
+    const StampNs stamp = stampNs(message->header.stamp);
+    if (!current(camera->config.name + " " + source, stamp)) return;
+    if (message->width == 0 || message->height == 0) {
+      health().count(camera->config.name + ": the network gave no scores for a selected image");
+      queue_->setSemantics(camera->index, stamp, false);
+    } else {
+      if (camera->semantics.find(stamp) == nullptr) camera->semantics.put(stamp, {});
+      if (Semantics* known = camera->semantics.find(stamp)) known->*part = message;
+    }
+    fuseComplete();
+  }
+
+  void onImage(Camera* camera, const sensor_msgs::ImageConstPtr& message) {
+    camera->images.put(stampNs(message->header.stamp), message);
+  }
+
+  void tick(StampNs /*now_ns*/) override { fuseComplete(); }
+
+  /// False for what is from before a clock jump; forgets what is pending after one.
+  bool current(const std::string& source, StampNs stamp) {
+    const StampVerdict verdict = epoch_.observe(source, stamp);
+    if (verdict == StampVerdict::kNewEpoch) {
+      health().count("clock jumps");
+      health().count("dropped: scan pending at a clock jump", queue_->pending());
+      queue_->reset();
+      tf_->source().clear();
+      for (const auto& camera : cameras_) {
+        camera->semantics.clear();
+        camera->images.clear();
+      }
+      NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
+    }
+    if (verdict == StampVerdict::kStale) {
+      health().count("dropped: " + source + " from before a clock jump");
+    }
+    return verdict != StampVerdict::kStale;
+  }
+
+  // --- Fusion
+
+  StampNs trueImageTime(const Camera& camera, StampNs raw_stamp) const {
+    return raw_stamp + toNs(camera.config.time_offset_s);
+  }
+
+  /// Tells the queue of every image whose semantics are whole and whose time odometry covers.
+  void announceReady() {
+    for (const auto& camera : cameras_) {
+      for (const auto& [stamp, known] : camera->semantics.values()) {
+        if (known.announced) continue;
+        const bool whole = known.probabilities || (known.scores && known.share);
+        if (!whole) continue;
+        if (rig().motion_enabled &&
+            !tf_->source().odometry().covers(trueImageTime(*camera, stamp))) {
+          continue;
+        }
+        camera->semantics.find(stamp)->announced = true;
+        queue_->setSemantics(camera->index, stamp, true);
+      }
+    }
+  }
+
+  void fuseComplete() {
+    announceReady();
+    for (const CompletedScan& scan : queue_->advance(now())) {
+      guard("fusion", [&] { fuse(scan); });
+    }
+    health().set("pending scans", std::to_string(queue_->pending()));
+  }
+
+  void fuse(const CompletedScan& scan) {
+    const StageTimer timer(health(), "fusion");
+    const Cloud& cloud = *scan.cloud;
+    const TransformAnswer T_vehicle_lidar =
+        tf_->source().extrinsics(rig().vehicle_frame, cloud.frame_id);
+    std::vector<CameraView> views;
+    for (const auto& camera : cameras_) {
+      const auto index = static_cast<std::size_t>(camera->index);
+      const std::optional<SegmentedImage> image = imageOf(*camera, scan.views[index]);
+      views.push_back(chain_->view(index, place(*camera, cloud.frame_id), image ? &*image : nullptr,
+                                   cloud.stamp, tf_->source().odometry(),
+                                   T_vehicle_lidar.transform));
+    }
+    const FusionResult result = chain_->fused(cloud, std::move(views));
+    countPoints(result.cloud);
+    publish(output_, semanticCloudMessage(result.cloud, rig().classes));
+    publishOverlays(scan, result);
+  }
+
+  /// Model and extrinsics; no model if either is unknown.
+  CameraPlace place(const Camera& camera, const std::string& lidar_frame) {
+    const std::string& name = camera.config.name;
+    CameraPlace place;
+    if (!camera.geometry.model()) {
+      health().count(name + ": no usable camera_info");
+      return place;
+    }
+    const TransformAnswer T_camera_lidar =
+        tf_->source().extrinsics(camera.geometry.frame(), lidar_frame);
+    if (!T_camera_lidar) {
+      health().count(name + ": no extrinsics");
+      warn("extrinsics " + name, name + ": " + T_camera_lidar.message);
+      return place;
+    }
+    place.model = camera.geometry.model();
+    place.T_camera_lidar = *T_camera_lidar.transform;
+    return place;
+  }
+
+  /// The semantics that a camera brings to a scan; empty, and counted, if none.
+  std::optional<SegmentedImage> imageOf(const Camera& camera, const CompletedScan::View& state) {
+    const std::string& name = camera.config.name;
+    if (state.state != ViewState::kReady) {
+      health().count(name + (state.state == ViewState::kNone ? ": no image in time"
+                             : state.timed_out               ? ": timed out"
+                                                             : ": no scores"));
+      return std::nullopt;
+    }
+    const Semantics* known = camera.semantics.find(state.image_stamp);
+    if (known == nullptr) {
+      health().count(name + ": semantics left the buffer");
+      return std::nullopt;
+    }
+    SegmentedImage image;
+    image.stamp = state.image_stamp;
+    if (known->probabilities) {
+      image.semantics.probabilities = pixelView(*known->probabilities);
+    } else {
+      image.semantics.scores =
+          ScoreMap(pixelView(*known->scores), rig().classes.size(), camera.config.score_format);
+      image.semantics.share = pixelView(*known->share);
+    }
+    return image;
+  }
+
+  void countPoints(const SemanticCloud& cloud) {
+    static const char* const kNames[] = {
+        "points fused", "points occluded", "points outside every image",
+        "points without an image in time", "points without odometry"};
+    std::uint64_t counts[5] = {};
+    for (const std::uint8_t status : cloud.points.status) ++counts[std::min<int>(status, 4)];
+    for (int i = 0; i < 5; ++i) health().count(kNames[i], counts[i]);
+    health().count("scans");
+  }
+
+  void publishOverlays(const CompletedScan& scan, const FusionResult& result) {
+    for (const CameraFusionReport& report : result.cameras) {
+      const auto found = std::find_if(cameras_.begin(), cameras_.end(), [&](const auto& camera) {
+        return camera->config.name == report.name;
+      });
+      Camera& camera = **found;
+      if (camera.overlay.getNumSubscribers() == 0) continue;
+      const StampNs stamp = scan.views[static_cast<std::size_t>(camera.index)].image_stamp;
+      const auto* image = camera.images.find(stamp);
+      if (image == nullptr) continue;
+      const StageTimer timer(health(), "overlay");
+      publish(
+          camera.overlay,
+          imageMessage(drawProjection(colorImage(*image), report, result.cloud, rig().classes,
+                                      toSeconds(trueImageTime(camera, stamp) - scan.cloud->stamp)),
+                       (*image)->header));
+    }
+  }
+
+  std::string explainSilence() override {
+    return cloud_subscriber_ ? "" : "nobody listens to " + output_.getTopic();
+  }
+
+  std::unique_ptr<FusionChain> chain_;
+  std::unique_ptr<FusionQueue> queue_;
+  std::unique_ptr<TfSubscription> tf_;
+  EpochMonitor epoch_;
+  std::vector<std::unique_ptr<Camera>> cameras_;
+  ros::Publisher output_, class_info_;
+  ros::Subscriber cloud_subscriber_, reference_subscriber_;
+};
+
+}  // namespace semantic_lidar_fusion
+
+PLUGINLIB_EXPORT_CLASS(semantic_lidar_fusion::ProjectionNodelet, nodelet::Nodelet)

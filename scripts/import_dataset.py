@@ -1,0 +1,177 @@
+#!/usr/bin/python3
+# SPDX-License-Identifier: MIT
+"""Turns a public data set in its own folder layout into a bag and a rig file for fuse_bag."""
+
+import argparse
+import os
+import sys
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+
+from semantic_lidar_fusion import cli  # noqa: E402
+
+DEFAULT_CLASSES = {
+    "kitti": "config/classes_cityscapes.yaml",
+    "semantickitti": "config/classes_semantickitti.yaml",
+    "rellis": "config/classes_rellis.yaml",
+}
+
+
+def make_parser():
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        epilog="Then: fuse_bag OUT.bag FUSED.bag --rig OUT.yaml",
+    )
+    datasets = parser.add_subparsers(dest="dataset", metavar="DATASET")
+    kitti = datasets.add_parser(
+        "kitti",
+        help="a KITTI raw drive",
+        description="A KITTI raw drive: DATE/DATE_drive_NNNN_sync (rectified images, odometry at 10 "
+        "Hz) or _extract (raw images, 100 Hz), with the calibration files in DATE; or its compact "
+        "form (numbered .jpg and .npz files beside calib_and_kissicp_poses.npz).",
+    )
+    kitti.add_argument(
+        "--cameras", type=_names, metavar="FOLDER,...", help="default: image_02,image_03"
+    )
+    semantickitti = datasets.add_parser(
+        "semantickitti",
+        help="a SemanticKITTI sequence",
+        description="A SemanticKITTI sequence, dataset/sequences/NN, with image_2 of KITTI odometry; "
+        "its labels become the topic points_truth.",
+    )
+    semantickitti.add_argument(
+        "--cameras", type=_names, metavar="FOLDER,...", help="default: image_2"
+    )
+    rellis = datasets.add_parser(
+        "rellis",
+        help="a RELLIS-3D sequence",
+        description="A RELLIS-3D sequence, Rellis-3D/0000N (images, scans as .ply or .bin, "
+        "camera_info.txt, transforms.yaml, poses.txt), or the compact form of one frame (frame.npz, "
+        "image.jpg); its labels become the topic points_truth.",
+    )
+    rellis.add_argument(
+        "--scores",
+        choices=["none", "onehot"],
+        default="none",
+        help="onehot: write the human label images as score images, so that fuse_bag needs no "
+        "network (default: none)",
+    )
+    rellis.add_argument(
+        "--score-stride", type=_positive, default=8, help="pixels per score cell (default: 8)"
+    )
+    rellis.add_argument(
+        "--score-gain", type=float, default=10.0, help="score of the labelled class (default: 10)"
+    )
+    rellis.add_argument(
+        "--distortion",
+        choices=["none", "published"],
+        default="none",
+        help="published: the coefficients of the data set's own example (default: none, as in "
+        "camera_info.txt, which fits better)",
+    )
+    for command in (kitti, semantickitti, rellis):
+        command.add_argument("folder", metavar="DIR", help="the folder of the drive or sequence")
+        command.add_argument("bag", metavar="OUT.bag", help="the bag to write")
+        command.add_argument("--rig-out", metavar="FILE", help="rig file (default: OUT.yaml)")
+        command.add_argument(
+            "--classes",
+            metavar="FILE",
+            help="class set (default: %s)" % DEFAULT_CLASSES[command.prog.split()[-1]],
+        )
+        command.add_argument(
+            "--model", metavar="FILE", default="", help="segmentation model to name in the rig file"
+        )
+        command.add_argument(
+            "--images",
+            choices=["compressed", "raw"],
+            default="compressed",
+            help="pass the image files on as they are, or decoded (default: compressed)",
+        )
+        command.add_argument(
+            "--first", type=_whole, default=0, metavar="N", help="first frame (default: 0)"
+        )
+        command.add_argument(
+            "--last", type=_whole, default=None, metavar="N", help="last frame (default: all)"
+        )
+    return parser
+
+
+def _names(text):
+    return text.split(",")
+
+
+def _whole(text):
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError("must not be negative")
+    return value
+
+
+def _positive(text):
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be positive")
+    return value
+
+
+def read_drive(options, labels):
+    """The records.Drive that the options ask for."""
+    from semantic_lidar_fusion import dataset_kitti, dataset_rellis, dataset_semantickitti
+
+    if options.dataset == "kitti":
+        return dataset_kitti.read(
+            options.folder, labels, options.cameras, options.first, options.last
+        )
+    if options.dataset == "semantickitti":
+        return dataset_semantickitti.read(
+            options.folder, labels, options.cameras, options.first, options.last
+        )
+    return dataset_rellis.read(
+        options.folder,
+        labels,
+        dataset_rellis.DISTORTIONS[options.distortion],
+        options.first,
+        options.last,
+    )
+
+
+def main():
+    parser = make_parser()
+    options = parser.parse_args()
+    if options.dataset is None:
+        parser.error("name a data set: kitti, semantickitti or rellis")
+    cli.require("numpy", "yaml", "rosbag", "sensor_msgs.msg", "tf2_msgs.msg")
+    from semantic_lidar_fusion import dataset_writer
+    from semantic_lidar_fusion.labels import LabelSet, package_file
+
+    labels = LabelSet.from_file(options.classes or package_file(DEFAULT_CLASSES[options.dataset]))
+    rig_path = options.rig_out or os.path.splitext(options.bag)[0] + ".yaml"
+    one_hot = getattr(options, "scores", "none") == "onehot"
+    summary = dataset_writer.write(
+        read_drive(options, labels),
+        options.bag,
+        rig_path,
+        dataset_writer.Options(
+            raw_images=options.images == "raw",
+            score_stride=options.score_stride if one_hot else 0,
+            score_gain=options.score_gain if one_hot else 0.0,
+            model=options.model,
+        ),
+    )
+    print(
+        "%s: %d scans (%d points), %d images, %d odometry readings"
+        % (options.bag, summary.scans, summary.points, summary.images, summary.odometry)
+        + (", %d score images" % summary.score_images if one_hot else "")
+        + (", %d labelled points" % summary.truth_points if summary.truth_points else "")
+    )
+    if summary.scans_with_image < summary.scans:
+        cli.warn(
+            "%d of %d scans have no image within 50 ms of their middle"
+            % (summary.scans - summary.scans_with_image, summary.scans)
+        )
+    print("%s: rig file" % rig_path)
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run(main)

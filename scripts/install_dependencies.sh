@@ -1,0 +1,118 @@
+#!/bin/bash
+# SPDX-License-Identifier: MIT
+# Installs the Debian or Ubuntu packages that building, testing and the demonstration need.
+# Uses sudo when not root, and only when something is missing; does nothing twice.
+#
+#   scripts/install_dependencies.sh [--help]
+set -euo pipefail
+PATH=/usr/sbin:/usr/bin:/sbin:/bin
+
+if [ "${1:-}" = --help ]; then
+  sed -n '3,6s/^# \{0,1\}//p' "$0"
+  exit 0
+fi
+
+# name on Debian (ROS in the distribution itself)
+debian_ros="catkin libroscpp-dev libnodelet-dev libnodeletlib-dev libnodeletlib-tools pluginlib-dev
+  libcv-bridge-dev libtf2-dev libtf2-ros-dev libtf2-eigen-dev libtf2-msgs-dev
+  libmessage-filters-dev libdiagnostic-updater-dev libsensor-msgs-dev libnav-msgs-dev
+  libstd-msgs-dev libgeometry-msgs-dev libdiagnostic-msgs-dev libroslib-dev librosbag-dev
+  librosbag-storage-dev librostest-dev python3-catkin-pkg python3-roslaunch python3-rosbag
+  python3-rospy python3-cv-bridge python3-tf2-ros python3-tf2-msgs python3-sensor-msgs
+  python3-nav-msgs python3-std-msgs python3-geometry-msgs python3-diagnostic-msgs
+  python3-rostopic python3-rosnode python3-rosparam python3-rostest python3-rosunit rosbash
+  rospack-tools tf2-tools"
+# name on Ubuntu 20.04 with the ROS Noetic repository
+noetic_ros="ros-noetic-catkin ros-noetic-roscpp ros-noetic-nodelet ros-noetic-pluginlib
+  ros-noetic-cv-bridge ros-noetic-tf2 ros-noetic-tf2-ros ros-noetic-tf2-eigen ros-noetic-tf2-msgs
+  ros-noetic-message-filters ros-noetic-diagnostic-updater ros-noetic-sensor-msgs
+  ros-noetic-nav-msgs ros-noetic-std-msgs ros-noetic-geometry-msgs ros-noetic-diagnostic-msgs
+  ros-noetic-roslib ros-noetic-rosbag ros-noetic-rosbag-storage ros-noetic-roslaunch
+  ros-noetic-rospy ros-noetic-rostopic ros-noetic-rosnode ros-noetic-rosparam ros-noetic-rostest
+  ros-noetic-rosunit ros-noetic-rosbash ros-noetic-tf2-tools"
+common="build-essential cmake libeigen3-dev libopencv-dev libyaml-cpp-dev libgtest-dev
+  python3-matplotlib python3-numpy python3-opencv python3-pytest python3-scipy python3-setuptools
+  python3-tqdm python3-yaml"
+# Each of these only adds something: the simulator, a peer in a test, the format checks.
+optional="libembree-dev libopencv-contrib-dev clang-format black"
+
+installed() { [ "$(dpkg-query -W -f='${db:Status-Status}' "$1" 2>/dev/null)" = installed ]; }
+offered() { apt-cache show "$1" >/dev/null 2>&1; }
+say() { echo "install_dependencies: $*"; }
+
+if ! command -v apt-get >/dev/null; then
+  say "no apt-get here; install the dependencies of package.xml by hand" >&2
+  exit 1
+fi
+
+if [ -d /opt/ros/noetic ]; then
+  required="$common $noetic_ros"
+else
+  required="$common $debian_ros"
+fi
+
+missing_of() {
+  local package
+  for package in "$@"; do
+    installed "$package" || echo "$package"
+  done
+}
+missing=$(missing_of $required)
+extra=$(missing_of $optional)
+if [ -z "$missing$extra" ]; then
+  say "nothing is missing"
+  exit 0
+fi
+
+as_root() { "$@"; }
+if [ "$(id -u)" -ne 0 ]; then
+  if command -v sudo >/dev/null; then
+    as_root() { sudo "$@"; }
+  elif [ -n "$missing" ]; then
+    say "not root and no sudo; missing:" $missing >&2
+    exit 1
+  else
+    say "not root and no sudo; going on without" $extra
+    exit 0
+  fi
+fi
+apt() {
+  as_root env DEBIAN_FRONTEND=noninteractive apt-get -q -o DPkg::Lock::Timeout=300 \
+    -o Acquire::Retries=3 "$@" </dev/null >/dev/null
+}
+
+# A release without an optional package is not asked for it again while its lists are there.
+offered_of() {
+  local package
+  for package in "$@"; do
+    ! offered "$package" || echo "$package"
+  done
+}
+lists() { ls /var/lib/apt/lists/*Packages* 2>/dev/null; }
+if [ -z "$missing" ] && [ -n "$(lists)" ] && [ -z "$(offered_of $extra)" ]; then
+  say "nothing is missing that this release has"
+  exit 0
+fi
+
+say "updating the package lists"
+if ! apt update; then
+  [ -z "$missing" ] || exit 1
+  say "going on without" $extra
+  exit 0
+fi
+if [ -n "$missing" ]; then
+  for package in $missing; do
+    offered "$package" && continue
+    say "this release does not offer $package; on Ubuntu 20.04 set up the ROS Noetic repository" \
+      "and install ros-noetic-ros-base first" >&2
+    exit 1
+  done
+  say "installing" $missing
+  apt install -y --no-install-recommends $missing
+fi
+extra=$(offered_of $extra)
+if [ -n "$extra" ]; then
+  say "installing" $extra
+  apt install -y --no-install-recommends $extra || say "going on without" $extra
+fi
+say "done"

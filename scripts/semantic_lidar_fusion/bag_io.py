@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: MIT
+"""Reading and writing bags.
+
+Times are integer nanoseconds, named `*_ns`. A writer makes its file aside and renames it when all
+is well, so that a bag with the wanted name is always a whole one. Messages of velodyne_msgs are
+read and written whether or not that package is installed.
+"""
+
+import os
+import struct
+from types import TracebackType
+from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Type
+
+from semantic_lidar_fusion import cli
+from semantic_lidar_fusion.errors import DataError
+
+_RULE = "=" * 80 + "\n"
+_HEADER = """Header header
+"""
+_HEADER_DEFINITION = (
+    _RULE
+    + """MSG: std_msgs/Header
+uint32 seq
+time stamp
+string frame_id
+"""
+)
+_PACKET_DEFINITION = """time stamp
+uint8[1206] data
+"""
+_DEFINITIONS = {
+    "velodyne_msgs/VelodynePacket": _PACKET_DEFINITION,
+    "velodyne_msgs/VelodyneScan": _HEADER
+    + "VelodynePacket[] packets\n"
+    + _RULE
+    + "MSG: velodyne_msgs/VelodynePacket\n"
+    + _PACKET_DEFINITION
+    + _HEADER_DEFINITION,
+}
+_MD5 = {
+    "velodyne_msgs/VelodynePacket": "ae4f90a23256f44e82baa08dd45c3456",
+    "velodyne_msgs/VelodyneScan": "50804fc9533a0e579e6322c04ae70566",
+}
+_generated: Dict[str, Any] = {}
+
+
+def to_ns(stamp: Any) -> int:
+    """A rospy Time or Duration (ns)."""
+    return int(stamp.secs) * 1000000000 + int(stamp.nsecs)
+
+
+def to_stamp(stamp_ns: int) -> Any:
+    """A genpy Time of integer nanoseconds; DataError outside what a ROS time holds."""
+    import genpy
+
+    seconds, nanoseconds = divmod(int(stamp_ns), 1000000000)
+    if not 0 <= seconds < 2**32:
+        raise DataError("%d ns is no ROS time (0 to 2^32 s)" % stamp_ns)
+    return genpy.Time(seconds, nanoseconds)
+
+
+def message_class(type_name: str) -> Any:
+    """The class of a message type ("sensor_msgs/Image"), of velodyne_msgs without its package.
+
+    Raises DataError if the type is not known here.
+    """
+    cli.require("genpy", "roslib.message")
+    import genpy.dynamic
+    import roslib.message
+
+    try:
+        found = roslib.message.get_message_class(type_name)
+    except Exception:  # roslib passes on whatever a broken package raises
+        found = None
+    if found is not None:
+        return found
+    if type_name not in _DEFINITIONS:
+        raise DataError("the message type %s is not installed" % type_name)
+    if type_name not in _generated:
+        generated = genpy.dynamic.generate_dynamic(type_name, _DEFINITIONS[type_name])
+        _generated.update(generated)
+        if _generated[type_name]._md5sum != _MD5[type_name]:
+            raise AssertionError("the definition of %s has changed" % type_name)
+    return _generated[type_name]
+
+
+class BagMessage(NamedTuple):
+    """One message of a bag, with its record time (ns)."""
+
+    topic: str
+    message: Any
+    stamp_ns: int
+
+
+class BagReader:
+    """A bag open for reading, as a context manager.
+
+    topics: topic -> message type, for every topic of the bag.
+    """
+
+    def __init__(self, path: str):
+        cli.require("rosbag")
+        import rosbag
+
+        self.path = path
+        try:
+            self._bag = rosbag.Bag(path, "r")
+        except OSError as error:
+            raise DataError("%s: %s" % (path, error.strerror or error)) from error
+        except rosbag.ROSBagUnindexedException as error:
+            raise DataError(
+                "%s: the bag has no index (recording was cut off); repair it with "
+                "`rosbag reindex`" % path
+            ) from error
+        except (rosbag.ROSBagException, struct.error, ValueError, KeyError) as error:
+            raise DataError("%s: not a readable bag (%s)" % (path, error)) from error
+        information = self._bag.get_type_and_topic_info()[1]
+        self.topics: Dict[str, str] = {name: entry[0] for name, entry in information.items()}
+        self._counts = {name: int(entry[1]) for name, entry in information.items()}
+
+    def __enter__(self) -> "BagReader":
+        return self
+
+    def __exit__(
+        self,
+        kind: Optional[Type[BaseException]],
+        error: Optional[BaseException],
+        trace: Optional[TracebackType],
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._bag.close()
+
+    def topics_of_type(self, type_name: str) -> List[str]:
+        """Names of the topics of a message type, sorted."""
+        return sorted(name for name, kind in self.topics.items() if kind == type_name)
+
+    def require_topic(self, topic: str, type_name: Optional[str] = None) -> None:
+        """DataError unless the bag has this topic (of this type)."""
+        if topic not in self.topics:
+            known = ", ".join(sorted(self.topics)) or "none"
+            raise DataError("%s: no topic %s (it has: %s)" % (self.path, topic, known))
+        if type_name is not None and self.topics[topic] != type_name:
+            raise DataError(
+                "%s: %s is %s, not %s" % (self.path, topic, self.topics[topic], type_name)
+            )
+
+    def count(self, topics: Optional[Sequence[str]] = None) -> int:
+        """Number of messages of these topics (default: all)."""
+        return sum(
+            self._counts.get(name, 0) for name in (self.topics if topics is None else topics)
+        )
+
+    def read(
+        self,
+        topics: Optional[Sequence[str]] = None,
+        types: Optional[Sequence[str]] = None,
+        start_ns: Optional[int] = None,
+        end_ns: Optional[int] = None,
+        label: Optional[str] = None,
+    ) -> Iterator[BagMessage]:
+        """Messages in order of record time, of the given topics and types (None = all), recorded
+        from start_ns to end_ns inclusive (ns). `label` shows a progress bar under that name."""
+        names = sorted(self.topics if topics is None else topics)
+        if types is not None:
+            names = [name for name in names if self.topics.get(name) in types]
+        names = [name for name in names if name in self.topics]
+        if not names:
+            return
+        import rosbag
+
+        entries: Iterable[Any] = self._bag.read_messages(
+            topics=names,
+            start_time=None if start_ns is None else to_stamp(start_ns),
+            end_time=None if end_ns is None else to_stamp(end_ns),
+        )
+        if label is not None:
+            entries = cli.progress(entries, self.count(names), label)
+        try:
+            for topic, message, stamp in entries:
+                yield BagMessage(topic, message, to_ns(stamp))
+        except (rosbag.ROSBagException, struct.error, OSError, EOFError) as error:
+            raise DataError("%s: damaged (%s)" % (self.path, error)) from error
+
+
+class AtomicFile:
+    """A path beside `path` that becomes `path` when committed, and vanishes otherwise."""
+
+    def __init__(self, path: str):
+        folder = os.path.dirname(os.path.abspath(path))
+        if not os.path.isdir(folder):
+            raise DataError("%s: the folder %s does not exist" % (path, folder))
+        if os.path.isdir(path):
+            raise DataError("%s: is a folder" % path)
+        self.path = path
+        self.temporary = os.path.join(
+            folder, ".%s.%d.partial" % (os.path.basename(path), os.getpid())
+        )
+
+    def commit(self) -> None:
+        os.replace(self.temporary, self.path)
+
+    def discard(self) -> None:
+        try:
+            os.remove(self.temporary)
+        except FileNotFoundError:
+            pass
+
+
+class BagWriter:
+    """A new bag as a context manager: it gets its name only if the block ends without an error."""
+
+    def __init__(self, path: str, compression: Optional[str] = None):
+        """`compression`: "none", "bz2", "lz4"; default lz4 where Python can write it."""
+        cli.require("rosbag")
+        import rosbag
+
+        if compression is None:
+            try:
+                import roslz4  # noqa: F401
+
+                compression = "lz4"
+            except ImportError:
+                compression = "none"
+        self.path = path
+        self._file = AtomicFile(path)
+        try:
+            self._bag = rosbag.Bag(self._file.temporary, "w", compression=compression)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _failed(self, error: OSError) -> DataError:
+        return DataError("%s: cannot be written (%s)" % (self.path, error.strerror or error))
+
+    def __enter__(self) -> "BagWriter":
+        return self
+
+    def write(self, topic: str, message: Any, stamp_ns: int, latched: bool = False) -> None:
+        """Appends a message with its record time (ns). `latched`: rosbag play keeps it for late
+        subscribers."""
+        header = None
+        if latched:
+            header = {
+                "topic": topic,
+                "type": message._type,
+                "md5sum": message._md5sum,
+                "message_definition": message._full_text,
+                "callerid": "/semantic_lidar_fusion",
+                "latching": "1",
+            }
+        try:
+            self._bag.write(topic, message, to_stamp(stamp_ns), connection_header=header)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def __exit__(
+        self,
+        kind: Optional[Type[BaseException]],
+        error: Optional[BaseException],
+        trace: Optional[TracebackType],
+    ) -> None:
+        try:
+            self._bag.close()
+            if kind is None:
+                self._file.commit()
+        except OSError as close_error:
+            if kind is None:
+                raise self._failed(close_error) from close_error
+        finally:
+            self._file.discard()
+
+
+def write_text(path: str, text: str) -> None:
+    """Writes a text file whole or not at all; DataError if it cannot be written."""
+    file = AtomicFile(path)
+    try:
+        with open(file.temporary, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        file.commit()
+    except OSError as error:
+        raise DataError("%s: cannot be written (%s)" % (path, error.strerror or error)) from error
+    finally:
+        file.discard()

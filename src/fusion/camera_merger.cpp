@@ -1,0 +1,164 @@
+// SPDX-License-Identifier: MIT
+#include "semantic_lidar_fusion/fusion/camera_merger.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <string>
+
+#include "semantic_lidar_fusion/common/error.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+/// One camera's vote for the point at hand.
+struct Vote {
+  const double* probabilities = nullptr;
+  std::int64_t time_difference_ns = 0;
+  float theta = 0;
+  int rig_index = 0;
+};
+
+/// The votes of one point, in order of camera name.
+struct PointVotes {
+  std::array<Vote, kMaxCameras> votes;
+  int count = 0;
+};
+
+void checkVotes(const std::vector<CameraVotes>& votes, std::size_t points, int class_count) {
+  if (class_count < 1) {
+    throw DataError("class_count " + std::to_string(class_count) + ": must be at least 1");
+  }
+  if (votes.size() > kMaxCameras) {
+    throw DataError("votes of " + std::to_string(votes.size()) + " cameras: at most " +
+                    std::to_string(kMaxCameras));
+  }
+  for (const CameraVotes& camera : votes) {
+    const std::string name = "votes of camera " + std::to_string(camera.rig_index) + ": ";
+    if (camera.rig_index < 0 || camera.rig_index >= kMaxCameras) {
+      throw DataError(name + "rig_index must be in 0.." + std::to_string(kMaxCameras - 1));
+    }
+    const std::size_t n = camera.index.size();
+    if (camera.probabilities.size() != n * static_cast<std::size_t>(class_count) ||
+        camera.time_difference_ns.size() != n || camera.theta.size() != n) {
+      throw DataError(name + "arrays must have one entry for each of " + std::to_string(n) +
+                      " points");
+    }
+    for (std::size_t i = 0; i < n; ++i) {
+      if (camera.index[i] >= points || (i > 0 && camera.index[i] <= camera.index[i - 1])) {
+        throw DataError(name + "index " + std::to_string(camera.index[i]) +
+                        " must ascend and be below " + std::to_string(points));
+      }
+    }
+  }
+}
+
+template <typename Key>
+void keepLeast(PointVotes* point, const Key& key) {
+  auto least = key(point->votes[0]);
+  for (int k = 1; k < point->count; ++k) least = std::min(least, key(point->votes[k]));
+  int kept = 0;
+  for (int k = 0; k < point->count; ++k) {
+    if (key(point->votes[k]) == least) point->votes[kept++] = point->votes[k];
+  }
+  point->count = kept;
+}
+
+void mean(const PointVotes& point, int class_count, double* out) {
+  for (int c = 0; c < class_count; ++c) {
+    double sum = 0;
+    for (int k = 0; k < point.count; ++k) sum += point.votes[k].probabilities[c];
+    out[c] = sum / point.count;
+  }
+}
+
+void product(const PointVotes& point, int class_count, double* out) {
+  double largest = -std::numeric_limits<double>::infinity();
+  for (int c = 0; c < class_count; ++c) {
+    out[c] = 0;
+    for (int k = 0; k < point.count; ++k) out[c] += std::log(point.votes[k].probabilities[c]);
+    largest = std::max(largest, out[c]);
+  }
+  if (!(largest > -std::numeric_limits<double>::infinity())) {
+    mean(point, class_count, out);
+    return;
+  }
+  double sum = 0;
+  for (int c = 0; c < class_count; ++c) {
+    out[c] = std::exp(out[c] - largest);
+    sum += out[c];
+  }
+  for (int c = 0; c < class_count; ++c) out[c] /= sum;
+}
+
+void write(const double* distribution, const PointVotes& point, std::size_t i,
+           double per_log_class_count, SemanticCloud* cloud) {
+  const int class_count = cloud->class_count;
+  float* out = &cloud->probabilities[i * static_cast<std::size_t>(class_count)];
+  double entropy = 0;
+  int label = 0;
+  for (int c = 0; c < class_count; ++c) {
+    out[c] = static_cast<float>(distribution[c]);
+    if (out[c] > out[label]) label = c;
+    if (distribution[c] > 0) entropy -= distribution[c] * std::log(distribution[c]);
+  }
+  cloud->points.status[i] = static_cast<std::uint8_t>(PointStatus::kFused);
+  cloud->label[i] = static_cast<std::uint8_t>(label);
+  cloud->confidence[i] = out[label];
+  cloud->entropy[i] =
+      static_cast<float>(std::min(1.0, std::max(0.0, entropy * per_log_class_count)));
+  std::uint16_t cameras = 0;
+  for (int k = 0; k < point.count; ++k) {
+    cameras = static_cast<std::uint16_t>(cameras | (1u << point.votes[k].rig_index));
+  }
+  cloud->cameras[i] = cameras;
+}
+
+}  // namespace
+
+void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, SemanticCloud* cloud) {
+  const std::size_t points = cloud->points.size();
+  const int class_count = cloud->class_count;
+  checkVotes(votes, points, class_count);
+  cloud->label.assign(points, kNoLabel);
+  cloud->confidence.assign(points, 0.0f);
+  cloud->entropy.assign(points, 1.0f);
+  cloud->cameras.assign(points, 0);
+  cloud->probabilities.assign(points * static_cast<std::size_t>(class_count), 0.0f);
+
+  const double per_log_class_count = class_count > 1 ? 1.0 / std::log(class_count) : 0.0;
+  std::vector<double> merged(static_cast<std::size_t>(class_count));
+  std::array<std::size_t, kMaxCameras> next{};
+  PointVotes point;
+  for (std::size_t i = 0; i < points; ++i) {
+    point.count = 0;
+    for (std::size_t k = 0; k < votes.size(); ++k) {
+      const CameraVotes& camera = votes[k];
+      const std::size_t row = next[k];
+      if (row == camera.index.size() || camera.index[row] != i) continue;
+      point.votes[point.count++] = {&camera.probabilities[row * class_count],
+                                    camera.time_difference_ns[row], camera.theta[row],
+                                    camera.rig_index};
+      ++next[k];
+    }
+    if (point.count == 0) continue;
+    if (rule == OverlapRule::kNearestInTime) {
+      keepLeast(&point, [](const Vote& vote) { return vote.time_difference_ns; });
+    } else if (rule == OverlapRule::kMostCentral) {
+      keepLeast(&point, [](const Vote& vote) { return vote.theta; });
+    }
+    const double* distribution = point.votes[0].probabilities;
+    if (point.count > 1) {
+      if (rule == OverlapRule::kProduct) {
+        product(point, class_count, merged.data());
+      } else {
+        mean(point, class_count, merged.data());
+      }
+      distribution = merged.data();
+    }
+    write(distribution, point, i, per_log_class_count, cloud);
+  }
+}
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,363 @@
+// SPDX-License-Identifier: MIT
+#include "semantic_lidar_fusion/fusion/semantic_projector.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdlib>
+#include <string>
+#include <utility>
+
+#include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/label_set.h"
+#include "semantic_lidar_fusion/projection/cloud_projector.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+std::string sizeText(const cv::Mat& image) {
+  return std::to_string(image.cols) + "x" + std::to_string(image.rows) + " with " +
+         std::to_string(image.channels()) + " channels of depth " + std::to_string(image.depth());
+}
+
+void checkConfig(const FusionConfig& config) {
+  std::vector<std::string> problems;
+  const auto require = [&problems](bool holds, const std::string& key, double value,
+                                   const std::string& rule) {
+    if (!holds) problems.push_back(key + ": " + std::to_string(value) + " must be " + rule);
+  };
+  const auto nonNegative = [&require](const std::string& key, double value) {
+    require(std::isfinite(value) && value >= 0, key, value, "finite and at least 0");
+  };
+  require(config.class_count >= 1 && config.class_count <= LabelSet::kMaxClasses, "class_count",
+          config.class_count, "in 1.." + std::to_string(LabelSet::kMaxClasses));
+  const double temperature = config.uncertainty.temperature;
+  require(std::isfinite(temperature) && temperature > 0, "uncertainty.temperature", temperature,
+          "finite and above 0");
+  nonNegative("uncertainty.exponent", config.uncertainty.exponent);
+  nonNegative("occlusion.vertical_step_deg", config.occlusion.vertical_step_deg);
+  nonNegative("occlusion.horizontal_step_deg", config.occlusion.horizontal_step_deg);
+  nonNegative("occlusion.depth_margin_m", config.occlusion.depth_margin_m);
+  nonNegative("occlusion.depth_margin_ratio", config.occlusion.depth_margin_ratio);
+  if (!problems.empty()) throw ConfigError(problems);
+}
+
+void checkSemantics(const std::string& camera, const ImageSemantics& semantics, int class_count) {
+  const bool lazy = !semantics.scores.empty() || !semantics.share.empty();
+  if (lazy == !semantics.probabilities.empty()) {
+    throw DataError(camera + "needs either scores with a share or probabilities, " +
+                    (lazy ? "has both" : "has neither"));
+  }
+  if (!lazy) {
+    if (semantics.probabilities.type() != CV_32FC(class_count)) {
+      throw DataError(camera + "probabilities are " + sizeText(semantics.probabilities) +
+                      ", must be 32-bit float (5) with " + std::to_string(class_count) +
+                      " channels");
+    }
+    return;
+  }
+  if (semantics.scores.empty()) throw DataError(camera + "has a share but no scores");
+  if (semantics.scores.classCount() != class_count) {
+    throw DataError(camera + "scores have " + std::to_string(semantics.scores.classCount()) +
+                    " channels, must have " + std::to_string(class_count));
+  }
+  if (semantics.share.empty()) throw DataError(camera + "has scores but no share");
+  if (semantics.share.type() != CV_32FC1) {
+    throw DataError(camera + "share is " + sizeText(semantics.share) +
+                    ", must be 32-bit float (5) with 1 channel");
+  }
+}
+
+void checkViews(const std::vector<CameraView>& views, int class_count) {
+  unsigned used = 0;
+  for (std::size_t i = 0; i < views.size(); ++i) {
+    const CameraView& view = views[i];
+    const std::string camera = "camera '" + view.name + "': ";
+    if (i > 0 && view.name == views[i - 1].name) throw DataError(camera + "given twice");
+    if (view.rig_index < 0 || view.rig_index >= kMaxCameras) {
+      throw DataError(camera + "rig_index " + std::to_string(view.rig_index) + " must be in 0.." +
+                      std::to_string(kMaxCameras - 1));
+    }
+    if (used >> view.rig_index & 1u) {
+      throw DataError(camera + "rig_index " + std::to_string(view.rig_index) +
+                      " belongs to another camera too");
+    }
+    used |= 1u << view.rig_index;
+    if (!view.ego_mask.empty() && view.ego_mask.type() != CV_8UC1) {
+      throw DataError(camera + "mask is " + sizeText(view.ego_mask) +
+                      ", must be 8-bit (0) with 1 channel");
+    }
+    if (!view.T_camera_lidar_static.matrix().allFinite() ||
+        !view.T_camera_lidar.matrix().allFinite()) {
+      throw DataError(camera + "transform from the lidar must be finite");
+    }
+    if (view.has_image && view.model) checkSemantics(camera, view.semantics, class_count);
+  }
+}
+
+/// Cells of one grid under the pixel centres of another, tabulated per column and row.
+class GridTable {
+ public:
+  GridTable(const ImageSize& source, const ImageSize& target)
+      : column_(axis(source.width, target.width)), row_(axis(source.height, target.height)) {}
+
+  int column(int source_column) const { return column_[static_cast<std::size_t>(source_column)]; }
+  int row(int source_row) const { return row_[static_cast<std::size_t>(source_row)]; }
+
+ private:
+  static std::vector<int> axis(int source, int target) {
+    std::vector<int> cells(static_cast<std::size_t>(source));
+    for (int i = 0; i < source; ++i) {
+      cells[static_cast<std::size_t>(i)] = cellUnderCentre(i, source, target);
+    }
+    return cells;
+  }
+
+  std::vector<int> column_, row_;
+};
+
+ImageSize sizeOf(const cv::Mat& image) { return {image.cols, image.rows}; }
+
+/// Whether a pixel of the image may transfer; without a mask, all may.
+class EgoMask {
+ public:
+  EgoMask(const cv::Mat& mask, const ImageSize& image)
+      : mask_(mask), table_(mask.empty() ? ImageSize{} : image, sizeOf(mask)) {}
+
+  bool hides(int column, int row) const {
+    return !mask_.empty() && mask_.at<std::uint8_t>(table_.row(row), table_.column(column)) == 0;
+  }
+
+ private:
+  cv::Mat mask_;
+  GridTable table_;
+};
+
+/// The class distribution of an image pixel (paper, eq. 3 and 4).
+class PixelDistribution {
+ public:
+  PixelDistribution(const ImageSemantics& semantics, const ImageSize& image,
+                    const UncertaintyConfig& config, int class_count)
+      : semantics_(semantics),
+        config_(config),
+        class_count_(class_count),
+        lazy_(semantics.probabilities.empty()),
+        superpixel_size_(sizeOf(lazy_ ? semantics.share : semantics.probabilities)),
+        to_superpixel_(image, superpixel_size_),
+        to_score_(lazy_ ? superpixel_size_ : ImageSize{},
+                  lazy_ ? semantics.scores.size() : ImageSize{}),
+        scores_(static_cast<std::size_t>(class_count)) {}
+
+  /// Writes class_count values that sum to 1; false if they are uniform for want of valid input.
+  bool read(int column, int row, double* out) {
+    const int q_column = to_superpixel_.column(column);
+    const int q_row = to_superpixel_.row(row);
+    return lazy_ ? readScores(q_column, q_row, out) : readProbabilities(q_column, q_row, out);
+  }
+
+ private:
+  bool readScores(int q_column, int q_row, double* out) {
+    if (!semantics_.scores.read(to_score_.column(q_column), to_score_.row(q_row), scores_.data())) {
+      return uniform(out);
+    }
+    const double share = semantics_.share.at<float>(q_row, q_column);
+    return temperedSoftmax(scores_.data(), class_count_, share, config_, out);
+  }
+
+  bool readProbabilities(int q_column, int q_row, double* out) const {
+    const float* p = semantics_.probabilities.ptr<float>(q_row) +
+                     static_cast<std::ptrdiff_t>(q_column) * class_count_;
+    double sum = 0;
+    bool valid = true;
+    for (int c = 0; c < class_count_; ++c) {
+      valid = valid && p[c] >= 0;
+      sum += p[c];
+    }
+    if (!valid || !std::isfinite(sum) || !(sum > 0)) return uniform(out);
+    // What only rounding to float moved off 1 passes bit for bit.
+    const double factor = std::abs(sum - 1.0) < 1e-6 ? 1.0 : 1.0 / sum;
+    for (int c = 0; c < class_count_; ++c) out[c] = p[c] * factor;
+    return true;
+  }
+
+  bool uniform(double* out) const {
+    std::fill(out, out + class_count_, 1.0 / class_count_);
+    return false;
+  }
+
+  const ImageSemantics& semantics_;
+  const UncertaintyConfig& config_;
+  int class_count_;
+  bool lazy_;
+  ImageSize superpixel_size_;
+  GridTable to_superpixel_;
+  GridTable to_score_;  ///< from superpixel pixels
+  std::vector<float> scores_;
+};
+
+/// Order of precedence among cameras: fused, occluded, no image, outside.
+int rank(PointStatus status) {
+  switch (status) {
+    case PointStatus::kFused:
+      return 0;
+    case PointStatus::kOccluded:
+      return 1;
+    case PointStatus::kNoImage:
+      return 2;
+    default:
+      return 3;
+  }
+}
+
+void improve(PointStatus status, std::uint8_t* of_point) {
+  if (rank(status) < rank(static_cast<PointStatus>(*of_point))) {
+    *of_point = static_cast<std::uint8_t>(status);
+  }
+}
+
+/// Projection, occlusion, ego mask and transfer in one camera that has an image.
+CameraVotes vote(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
+                 const BeamGrid& grid, CameraFusionReport* report) {
+  const CameraModel& model = *view.model;
+  const ImageSize& size = model.imageSize();
+  const double margin_px = castMarginPx(model, grid, config.occlusion);
+  const ProjectedPoints points = projectCloud(cloud, view.T_camera_lidar, model, margin_px);
+  const std::vector<std::uint8_t> visible =
+      visiblePoints(cloud, points, view.T_camera_lidar, model, grid, config.occlusion);
+
+  const EgoMask mask(view.ego_mask, size);
+  PixelDistribution distribution(view.semantics, size, config.uncertainty, config.class_count);
+  const std::size_t classes = static_cast<std::size_t>(config.class_count);
+  CameraVotes votes;
+  votes.rig_index = view.rig_index;
+  votes.index.reserve(points.size());
+  votes.time_difference_ns.reserve(points.size());
+  votes.theta.reserve(points.size());
+  votes.probabilities.resize(points.size() * classes);
+  report->index.reserve(points.size());
+  report->u.reserve(points.size());
+  report->v.reserve(points.size());
+  report->status.reserve(points.size());
+  for (std::size_t k = 0; k < points.size(); ++k) {
+    const double u = points.u[k], v = points.v[k];
+    if (!inImage(u, v, size)) continue;
+    const int column = pixelIndex(u), row = pixelIndex(v);
+    PointStatus status = visible[k] ? PointStatus::kFused : PointStatus::kOccluded;
+    if (mask.hides(column, row)) status = PointStatus::kOutsideImages;
+    const std::uint32_t i = points.index[k];
+    report->index.push_back(i);
+    report->u.push_back(points.u[k]);
+    report->v.push_back(points.v[k]);
+    report->status.push_back(status);
+    if (status != PointStatus::kFused) continue;
+    if (!distribution.read(column, row, &votes.probabilities[votes.index.size() * classes])) {
+      ++report->nonfinite;
+    }
+    votes.index.push_back(i);
+    votes.time_difference_ns.push_back(std::abs(cloud.stamp + toNs(cloud.dt[i]) - view.image_ns));
+    votes.theta.push_back(points.theta[k]);
+  }
+  votes.probabilities.resize(votes.index.size() * classes);
+  return votes;
+}
+
+/// Marks the points that would lie in the image of a camera that has none.
+void markWithoutImage(const Cloud& cloud, const CameraView& view,
+                      std::vector<std::uint8_t>* status) {
+  const CameraModel& model = *view.model;
+  const ImageSize& size = model.imageSize();
+  const EgoMask mask(view.ego_mask, size);
+  const ProjectedPoints points = projectCloud(cloud, view.T_camera_lidar_static, model, 0.0);
+  for (std::size_t k = 0; k < points.size(); ++k) {
+    const double u = points.u[k], v = points.v[k];
+    if (!inImage(u, v, size) || mask.hides(pixelIndex(u), pixelIndex(v))) continue;
+    improve(PointStatus::kNoImage, &(*status)[points.index[k]]);
+  }
+}
+
+template <typename T>
+void keepRows(const std::vector<std::uint32_t>& rows, std::size_t width, std::vector<T>* values) {
+  for (std::size_t k = 0; k < rows.size(); ++k) {
+    std::copy_n(values->begin() + static_cast<std::ptrdiff_t>(rows[k] * width), width,
+                values->begin() + static_cast<std::ptrdiff_t>(k * width));
+  }
+  values->resize(rows.size() * width);
+}
+
+void keepFused(SemanticCloud* cloud) {
+  std::vector<std::uint32_t> rows;
+  for (std::size_t i = 0; i < cloud->size(); ++i) {
+    if (cloud->points.status[i] == static_cast<std::uint8_t>(PointStatus::kFused)) {
+      rows.push_back(static_cast<std::uint32_t>(i));
+    }
+  }
+  Cloud& points = cloud->points;
+  keepRows(rows, 1, &points.x);
+  keepRows(rows, 1, &points.y);
+  keepRows(rows, 1, &points.z);
+  keepRows(rows, 1, &points.intensity);
+  keepRows(rows, 1, &points.ring);
+  keepRows(rows, 1, &points.dt);
+  keepRows(rows, 1, &points.status);
+  keepRows(rows, 1, &cloud->label);
+  keepRows(rows, 1, &cloud->confidence);
+  keepRows(rows, 1, &cloud->entropy);
+  keepRows(rows, 1, &cloud->cameras);
+  keepRows(rows, static_cast<std::size_t>(cloud->class_count), &cloud->probabilities);
+}
+
+}  // namespace
+
+SemanticProjector::SemanticProjector(const FusionConfig& config) : config_(config) {
+  checkConfig(config_);
+}
+
+FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView> views) const {
+  std::sort(views.begin(), views.end(),
+            [](const CameraView& a, const CameraView& b) { return a.name < b.name; });
+  checkViews(views, config_.class_count);
+
+  FusionResult result;
+  result.cloud.points = cloud;
+  result.cloud.class_count = config_.class_count;
+  std::vector<std::uint8_t>& status = result.cloud.points.status;
+  for (std::uint8_t& s : status) {
+    if (s != static_cast<std::uint8_t>(PointStatus::kNoOdometry)) {
+      s = static_cast<std::uint8_t>(PointStatus::kOutsideImages);
+    }
+  }
+
+  const bool any_image = std::any_of(views.begin(), views.end(), [](const CameraView& view) {
+    return view.has_image && view.model;
+  });
+  BeamGrid grid;
+  if (any_image && !cloud.empty() && config_.occlusion.mode != OcclusionMode::kOff) {
+    grid = beamGrid(cloud, config_.occlusion);
+  }
+
+  std::vector<CameraVotes> votes;
+  votes.reserve(views.size());
+  for (const CameraView& view : views) {
+    result.cameras.emplace_back();
+    CameraFusionReport& report = result.cameras.back();
+    report.name = view.name;
+    if (!view.model || cloud.empty()) continue;
+    if (!view.has_image) {
+      markWithoutImage(cloud, view, &status);
+      continue;
+    }
+    votes.push_back(vote(cloud, view, config_, grid, &report));
+    for (std::size_t k = 0; k < report.index.size(); ++k) {
+      improve(report.status[k], &status[report.index[k]]);
+    }
+  }
+
+  mergeVotes(votes, config_.overlap, &result.cloud);
+  for (CameraFusionReport& report : result.cameras) {
+    report.label.reserve(report.index.size());
+    for (const std::uint32_t i : report.index) report.label.push_back(result.cloud.label[i]);
+  }
+  if (!config_.keep_unlabelled) keepFused(&result.cloud);
+  return result;
+}
+
+}  // namespace semantic_lidar_fusion

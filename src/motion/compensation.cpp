@@ -1,0 +1,461 @@
+// SPDX-License-Identifier: MIT
+#include "semantic_lidar_fusion/motion/compensation.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <unordered_map>
+#include <vector>
+
+namespace semantic_lidar_fusion {
+namespace {
+
+/// Longest rotation that one Segment spans. Inside it transforms are linear in time, so a point is
+/// off by at most (its distance from the vehicle's origin) * angle^2 / 8: 0.013 mm at 100 m.
+constexpr double kSegmentAngle = 1e-3;
+/// Longest duration of a Segment: times within it are 32-bit nanoseconds.
+constexpr StampNs kSegmentNs = kNsPerSecond;
+
+/// T_a_b of two poses in one frame. The difference of the positions comes first, so that nothing is
+/// lost to large coordinates.
+Transform relative(const Transform& T_fixed_a, const Transform& T_fixed_b) {
+  Transform T_a_b = Transform::Identity();
+  const Eigen::Matrix3d inverse_rotation = T_fixed_a.linear().transpose();
+  T_a_b.linear() = inverse_rotation * T_fixed_b.linear();
+  T_a_b.translation() = inverse_rotation * (T_fixed_b.translation() - T_fixed_a.translation());
+  return T_a_b;
+}
+
+Eigen::Matrix3d skew(const Eigen::Vector3d& v) {
+  Eigen::Matrix3d matrix;
+  matrix << 0.0, -v.z(), v.y(), v.z(), 0.0, -v.x(), -v.y(), v.x(), 0.0;
+  return matrix;
+}
+
+/// Motion `step` (T_first_second) continued at constant twist to `fraction` times its duration: the
+/// screw motion exp(fraction * log(step)).
+Transform screw(const Transform& step, double fraction) {
+  const Eigen::AngleAxisd rotation(step.linear());
+  const double angle = rotation.angle();
+  // V(phi) = I + b [axis]x + c [axis]x^2 maps the twist's linear part to the translation.
+  const Eigen::Matrix3d axis = skew(rotation.axis());
+  const auto integral = [&](double phi) -> Eigen::Matrix3d {
+    const double b = std::abs(phi) < 1e-9 ? phi / 2.0 : (1.0 - std::cos(phi)) / phi;
+    const double c = std::abs(phi) < 1e-9 ? phi * phi / 6.0 : 1.0 - std::sin(phi) / phi;
+    return Eigen::Matrix3d::Identity() + b * axis + c * axis * axis;
+  };
+  const Eigen::Vector3d velocity = integral(angle).inverse() * step.translation();
+  Transform result = Transform::Identity();
+  result.linear() = Eigen::AngleAxisd(fraction * angle, rotation.axis()).toRotationMatrix();
+  result.translation() = integral(fraction * angle) * (fraction * velocity);
+  return result;
+}
+
+/// A span of time in which T_lidar(t_ref)_lidar(t) is linear in t. Relative to t_ref the numbers
+/// are small, so that float holds them; rows of 3x4 matrices.
+struct Segment {
+  StampNs begin_ns = 0;
+  StampNs end_ns = 0;          ///< inclusive
+  float start[12] = {};        ///< transform at begin_ns
+  float rate_per_ns[12] = {};  ///< its change
+
+  bool contains(StampNs t) const { return begin_ns <= t && t <= end_ns; }
+};
+
+/// T_lidar(t_ref)_lidar(t) as a sequence of segments.
+class Track {
+ public:
+  Track(const Transform& T_fixed_vehicle_ref, const Transform& T_vehicle_lidar)
+      : T_fixed_vehicle_ref_(T_fixed_vehicle_ref),
+        T_vehicle_lidar_(T_vehicle_lidar),
+        T_lidar_vehicle_(T_vehicle_lidar.inverse(Eigen::Isometry)) {}
+
+  /// The pose stands still from `begin_ns` to `end_ns`.
+  void addStill(const Transform& T_fixed_vehicle, StampNs begin_ns, StampNs end_ns) {
+    const Matrix34 pose = toReference(T_fixed_vehicle);
+    addLinear(pose, pose, begin_ns, end_ns);
+  }
+
+  /// The vehicle moves as `pose_at(t)` says, by rotations up to `angle` in all.
+  template <typename PoseAt>
+  void addMoving(const PoseAt& pose_at, double angle, StampNs begin_ns, StampNs end_ns) {
+    const StampNs duration = end_ns - begin_ns;
+    const StampNs count = std::max({static_cast<StampNs>(std::ceil(angle / kSegmentAngle)),
+                                    (duration + kSegmentNs - 1) / kSegmentNs, StampNs{1}});
+    Matrix34 from = toReference(pose_at(begin_ns));
+    StampNs from_ns = begin_ns;
+    for (StampNs i = 1; i <= count; ++i) {
+      // The remainder apart: duration * i may exceed 64 bits.
+      const StampNs to_ns = begin_ns + duration / count * i + duration % count * i / count;
+      const Matrix34 to = toReference(pose_at(to_ns));
+      addLinear(from, to, from_ns, to_ns);
+      from = to;
+      from_ns = to_ns;
+    }
+  }
+
+  /// The segment of a time (the first one's for earlier times, the last one's for later); fast
+  /// where times ascend slowly.
+  const Segment& find(StampNs t) {
+    if (segments_[last_].contains(t)) return segments_[last_];
+    if (last_ + 1 < segments_.size() && segments_[last_ + 1].contains(t)) {
+      return segments_[++last_];
+    }
+    const auto after = std::upper_bound(
+        segments_.begin(), segments_.end(), t,
+        [](StampNs time, const Segment& segment) { return time < segment.begin_ns; });
+    last_ = after == segments_.begin()
+                ? 0
+                : static_cast<std::size_t>(std::distance(segments_.begin(), after)) - 1;
+    return segments_[last_];
+  }
+
+ private:
+  using Matrix34 = Eigen::Matrix<double, 3, 4, Eigen::RowMajor>;
+
+  /// Equation 5.
+  Matrix34 toReference(const Transform& T_fixed_vehicle) const {
+    const Transform T_ref_t =
+        T_lidar_vehicle_ * relative(T_fixed_vehicle_ref_, T_fixed_vehicle) * T_vehicle_lidar_;
+    return T_ref_t.matrix().topRows<3>();
+  }
+
+  void addLinear(const Matrix34& from, const Matrix34& to, StampNs begin_ns, StampNs end_ns) {
+    Segment segment;
+    segment.begin_ns = begin_ns;
+    segment.end_ns = end_ns;
+    const double per_ns = end_ns > begin_ns ? 1.0 / static_cast<double>(end_ns - begin_ns) : 0.0;
+    for (int i = 0; i < 12; ++i) {
+      segment.start[i] = static_cast<float>(from.data()[i]);
+      segment.rate_per_ns[i] = static_cast<float>((to.data()[i] - from.data()[i]) * per_ns);
+    }
+    segments_.push_back(segment);
+  }
+
+  Transform T_fixed_vehicle_ref_;
+  Transform T_vehicle_lidar_;
+  Transform T_lidar_vehicle_;
+  std::vector<Segment> segments_;
+  std::size_t last_ = 0;
+};
+
+double angleBetween(const Transform& a, const Transform& b) {
+  return Eigen::Quaterniond(a.linear()).angularDistance(Eigen::Quaterniond(b.linear()));
+}
+
+/// What becomes of a firing's points.
+enum class Fate : std::uint8_t { kMove, kMark, kDrop };
+
+struct Plan {
+  std::vector<StampNs> packet_times;  ///< of each firing; empty: each point's own time counts
+  std::vector<Fate> fates;            ///< of each firing
+  std::vector<bool> uncovered;        ///< for each firing, whether odometry leaves it out
+  std::size_t uncovered_count = 0;
+  StampNs first_ns = std::numeric_limits<StampNs>::max();  ///< times of the poses that are needed,
+  StampNs last_ns = std::numeric_limits<StampNs>::min();   ///< none if first > last
+};
+
+/// For each firing the time of its packet's first firing.
+std::vector<StampNs> packetTimes(const TimedCloud& scan) {
+  std::unordered_map<std::uint32_t, StampNs> first_of_packet;
+  for (const Firing& firing : scan.firings) {
+    const auto entry = first_of_packet.emplace(firing.packet, firing.begin_ns).first;
+    entry->second = std::min(entry->second, firing.begin_ns);
+  }
+  std::vector<StampNs> times;
+  times.reserve(scan.firings.size());
+  for (const Firing& firing : scan.firings) times.push_back(first_of_packet.at(firing.packet));
+  return times;
+}
+
+Fate fateOfUncovered(StampNs begin_ns, StampNs end_ns, const PoseBuffer& odometry,
+                     const CompensationConfig& config) {
+  const auto& readings = odometry.readings();
+  switch (config.on_missing) {
+    case OnMissingOdometry::kDrop:
+      return Fate::kDrop;
+    case OnMissingOdometry::kHold:
+      return readings.empty() ? Fate::kMark : Fate::kMove;
+    case OnMissingOdometry::kExtrapolate:
+      return readings.size() >= 2 &&
+                     begin_ns >= readings.front().stamp - config.max_extrapolation_ns &&
+                     end_ns <= readings.back().stamp + config.max_extrapolation_ns
+                 ? Fate::kMove
+                 : Fate::kMark;
+    case OnMissingOdometry::kMark:
+      break;
+  }
+  return Fate::kMark;
+}
+
+Plan makePlan(const TimedCloud& scan, const PoseBuffer& odometry, bool reference_covered,
+              const CompensationConfig& config) {
+  Plan plan;
+  const bool by_packet = config.granularity == MotionGranularity::kPacket;
+  if (by_packet) plan.packet_times = packetTimes(scan);
+  plan.fates.assign(scan.firings.size(), Fate::kMove);
+  plan.uncovered.assign(scan.firings.size(), false);
+  const auto& readings = odometry.readings();
+  const StampNs covered_from = readings.empty() ? 1 : readings.front().stamp;
+  const StampNs covered_to = readings.empty() ? 0 : readings.back().stamp;
+  for (std::size_t k = 0; k < scan.firings.size(); ++k) {
+    const StampNs begin = by_packet ? plan.packet_times[k] : scan.firings[k].begin_ns;
+    const StampNs end = scan.firings[k].end_ns;
+    if (begin < covered_from || end > covered_to) {
+      plan.uncovered[k] = true;
+      ++plan.uncovered_count;
+      plan.fates[k] = fateOfUncovered(begin, end, odometry, config);
+    }
+    if (!reference_covered && plan.fates[k] == Fate::kMove) plan.fates[k] = Fate::kMark;
+    if (plan.fates[k] != Fate::kMove) continue;
+    plan.first_ns = std::min(plan.first_ns, begin);
+    plan.last_ns = std::max(plan.last_ns, by_packet ? begin : end);
+  }
+  return plan;
+}
+
+Track makeTrack(const PoseBuffer& odometry, const Transform& T_fixed_vehicle_ref,
+                const Transform& T_vehicle_lidar, const CompensationConfig& config,
+                const Plan& plan) {
+  const StampNs first = plan.first_ns;
+  const StampNs last = plan.last_ns;
+  Track track(T_fixed_vehicle_ref, T_vehicle_lidar);
+  const auto& readings = odometry.readings();
+  const bool twist = config.on_missing == OnMissingOdometry::kExtrapolate && readings.size() >= 2;
+
+  const auto addOutside = [&](const StampedPose& edge, const StampedPose& inner, StampNs begin,
+                              StampNs end) {
+    if (!twist) {
+      track.addStill(edge.T_fixed_vehicle, begin, end);
+      return;
+    }
+    const Transform step = relative(inner.T_fixed_vehicle, edge.T_fixed_vehicle);
+    const double step_ns = static_cast<double>(edge.stamp - inner.stamp);  // negative before
+    const double angle = angleBetween(inner.T_fixed_vehicle, edge.T_fixed_vehicle) *
+                         static_cast<double>(end - begin) / std::abs(step_ns);
+    track.addMoving(
+        [&](StampNs t) -> Transform {
+          return edge.T_fixed_vehicle * screw(step, static_cast<double>(t - edge.stamp) / step_ns);
+        },
+        angle, begin, end);
+  };
+
+  const StampedPose& front = readings.front();
+  const StampedPose& back = readings.back();
+  if (first < front.stamp) {
+    addOutside(front, twist ? readings[1] : front, first, std::min(last, front.stamp));
+  }
+  // From the last reading before the first time on.
+  const auto from =
+      std::lower_bound(readings.begin(), readings.end(), first,
+                       [](const StampedPose& reading, StampNs t) { return reading.stamp < t; });
+  const std::size_t start =
+      from == readings.begin() ? 0 : static_cast<std::size_t>(from - readings.begin()) - 1;
+  if (config.lookup == OdometryLookup::kClosest) {
+    for (std::size_t i = start; i < readings.size(); ++i) {
+      // Half-way belongs to the earlier reading.
+      const StampNs begin =
+          i == 0 ? front.stamp
+                 : readings[i - 1].stamp + (readings[i].stamp - readings[i - 1].stamp) / 2 + 1;
+      const StampNs end = i + 1 == readings.size()
+                              ? back.stamp
+                              : readings[i].stamp + (readings[i + 1].stamp - readings[i].stamp) / 2;
+      if (end < first) continue;
+      if (begin > last) break;
+      track.addStill(readings[i].T_fixed_vehicle, begin, end);
+    }
+  } else {
+    for (std::size_t i = start; i < readings.size() && readings[i].stamp <= last; ++i) {
+      const StampedPose& a = readings[i];
+      const StampedPose& b = readings[std::min(i + 1, readings.size() - 1)];
+      const StampNs begin = std::max(a.stamp, first);
+      const StampNs end = std::min(b.stamp, last);
+      if (begin > end) continue;
+      if (a.stamp == b.stamp) {
+        track.addStill(a.T_fixed_vehicle, begin, end);
+        continue;
+      }
+      const double duration = static_cast<double>(b.stamp - a.stamp);
+      const double angle = angleBetween(a.T_fixed_vehicle, b.T_fixed_vehicle) *
+                           static_cast<double>(end - begin) / duration;
+      track.addMoving(
+          [&](StampNs t) {
+            return interpolate(a.T_fixed_vehicle, b.T_fixed_vehicle,
+                               static_cast<double>(t - a.stamp) / duration);
+          },
+          angle, begin, end);
+    }
+  }
+  if (last > back.stamp) {
+    addOutside(back, twist ? readings[readings.size() - 2] : back, std::max(first, back.stamp),
+               last);
+  }
+  return track;
+}
+
+/// The arrays are all distinct; the compiler must know it to use vector instructions.
+void transform(const Segment& segment, std::size_t count, const float* __restrict ns,
+               const float* __restrict x, const float* __restrict y, const float* __restrict z,
+               float* __restrict out_x, float* __restrict out_y, float* __restrict out_z) {
+  const auto& a = segment.start;
+  const auto& r = segment.rate_per_ns;
+  for (std::size_t i = 0; i < count; ++i) {
+    out_x[i] = a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3] +
+               ns[i] * (r[0] * x[i] + r[1] * y[i] + r[2] * z[i] + r[3]);
+    out_y[i] = a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7] +
+               ns[i] * (r[4] * x[i] + r[5] * y[i] + r[6] * z[i] + r[7]);
+    out_z[i] = a[8] * x[i] + a[9] * y[i] + a[10] * z[i] + a[11] +
+               ns[i] * (r[8] * x[i] + r[9] * y[i] + r[10] * z[i] + r[11]);
+  }
+}
+
+/// Moves points [begin, end), whose poses lie in `segment`, each at its own time or all at
+/// `*pose_time`.
+void move(const TimedCloud& scan, std::size_t begin, std::size_t end, const Segment& segment,
+          const StampNs* pose_time, Cloud& cloud) {
+  Segment s = segment;
+  if (pose_time) {
+    const float ns = static_cast<float>(*pose_time - s.begin_ns);
+    for (int k = 0; k < 12; ++k) {
+      s.start[k] += ns * s.rate_per_ns[k];
+      s.rate_per_ns[k] = 0.0f;
+    }
+  }
+  // Times first, then coordinates: 64-bit integers keep compilers from using vector instructions.
+  constexpr std::size_t kBlock = 256;
+  float ns[kBlock];
+  for (; begin < end; begin += kBlock) {
+    const std::size_t count = std::min(kBlock, end - begin);
+    for (std::size_t i = 0; i < count; ++i) {
+      ns[i] = static_cast<float>(static_cast<std::int32_t>(scan.time_ns[begin + i] - s.begin_ns));
+    }
+    transform(s, count, ns, scan.x.data() + begin, scan.y.data() + begin, scan.z.data() + begin,
+              cloud.x.data() + begin, cloud.y.data() + begin, cloud.z.data() + begin);
+  }
+}
+
+void moveAll(const TimedCloud& scan, const Plan& plan, Track& track, Cloud& cloud) {
+  const bool by_packet = !plan.packet_times.empty();
+  const bool all_move = std::all_of(plan.fates.begin(), plan.fates.end(),
+                                    [](Fate fate) { return fate == Fate::kMove; });
+  const auto moves = [&](std::size_t i) {
+    return all_move || plan.fates[scan.firing[i]] == Fate::kMove;
+  };
+  for (std::size_t i = 0; i < scan.size();) {
+    std::size_t end = i + 1;
+    if (moves(i)) {
+      // The longest run of points that share a segment.
+      const StampNs* const pose_time = by_packet ? &plan.packet_times[scan.firing[i]] : nullptr;
+      const Segment& segment = track.find(by_packet ? *pose_time : scan.time_ns[i]);
+      const auto shares_segment = [&](std::size_t j) {
+        return by_packet ? plan.packet_times[scan.firing[j]] == *pose_time
+                         : segment.contains(scan.time_ns[j]);
+      };
+      while (end < scan.size() && shares_segment(end) && moves(end)) ++end;
+      move(scan, i, end, segment, pose_time, cloud);
+    }
+    i = end;
+  }
+}
+
+/// Sets the status of points that do not move, and counts.
+void markAndCount(const TimedCloud& scan, const Plan& plan, const CompensationConfig& config,
+                  Cloud& cloud, CompensationCounters& counters) {
+  for (std::size_t i = 0; i < scan.size(); ++i) {
+    const std::uint32_t firing = scan.firing[i];
+    if (plan.fates[firing] == Fate::kMark) {
+      cloud.status[i] = static_cast<std::uint8_t>(PointStatus::kNoOdometry);
+      ++counters.marked_points;
+    } else if (plan.fates[firing] == Fate::kDrop) {
+      ++counters.dropped_points;
+    } else if (plan.uncovered[firing]) {
+      ++(config.on_missing == OnMissingOdometry::kHold ? counters.held_points
+                                                       : counters.extrapolated_points);
+    }
+  }
+}
+
+void removeDropped(const TimedCloud& scan, const std::vector<Fate>& fates, Cloud& cloud) {
+  std::size_t kept = 0;
+  for (std::size_t i = 0; i < scan.size(); ++i) {
+    if (fates[scan.firing[i]] == Fate::kDrop) continue;
+    cloud.x[kept] = cloud.x[i];
+    cloud.y[kept] = cloud.y[i];
+    cloud.z[kept] = cloud.z[i];
+    cloud.intensity[kept] = cloud.intensity[i];
+    cloud.ring[kept] = cloud.ring[i];
+    cloud.dt[kept] = cloud.dt[i];
+    cloud.status[kept] = cloud.status[i];
+    ++kept;
+  }
+  cloud.resize(kept);
+}
+
+/// time - reference in s.
+void secondsSince(StampNs reference_ns, const std::vector<StampNs>& times, const ScanInterval& span,
+                  std::vector<float>& seconds) {
+  seconds.resize(times.size());
+  constexpr StampNs kNear = std::numeric_limits<std::int32_t>::max();
+  if (span.first_ns >= reference_ns - kNear && span.last_ns <= reference_ns + kNear) {
+    // 32-bit integers convert by vector instructions.
+    for (std::size_t i = 0; i < times.size(); ++i) {
+      seconds[i] = static_cast<float>(1e-9 * static_cast<std::int32_t>(times[i] - reference_ns));
+    }
+  } else {
+    for (std::size_t i = 0; i < times.size(); ++i) {
+      seconds[i] = static_cast<float>(toSeconds(times[i] - reference_ns));
+    }
+  }
+}
+
+Cloud asMeasured(const TimedCloud& scan, StampNs reference_ns) {
+  const ScanInterval span = scanInterval(scan);
+  Cloud cloud;
+  cloud.frame_id = scan.frame_id;
+  cloud.stamp = scan.empty() ? scan.header_stamp : reference_ns;
+  cloud.first_point_ns = span.first_ns;
+  cloud.x = scan.x;
+  cloud.y = scan.y;
+  cloud.z = scan.z;
+  cloud.intensity = scan.intensity;
+  cloud.ring = scan.ring;
+  cloud.status.assign(scan.size(), static_cast<std::uint8_t>(PointStatus::kFused));
+  secondsSince(reference_ns, scan.time_ns, span, cloud.dt);
+  return cloud;
+}
+
+}  // namespace
+
+CompensationResult compensate(const TimedCloud& scan, StampNs reference_ns,
+                              const PoseBuffer& odometry, const Transform& T_vehicle_lidar,
+                              const CompensationConfig& config) {
+  CompensationResult result;
+  Cloud& cloud = result.cloud;
+  CompensationCounters& counters = result.counters;
+  cloud = asMeasured(scan, reference_ns);
+  if (!config.enabled || scan.empty()) return result;
+
+  const std::optional<Transform> T_fixed_vehicle_ref = odometry.lookup(reference_ns);
+  counters.reference_covered = T_fixed_vehicle_ref.has_value();
+
+  const Plan plan = makePlan(scan, odometry, counters.reference_covered, config);
+  counters.uncovered_firings = plan.uncovered_count;
+  if (plan.first_ns <= plan.last_ns) {
+    Track track = makeTrack(odometry, *T_fixed_vehicle_ref, T_vehicle_lidar, config, plan);
+    moveAll(scan, plan, track, cloud);
+  }
+  if (plan.uncovered_count > 0 || !counters.reference_covered) {
+    markAndCount(scan, plan, config, cloud, counters);
+    if (counters.dropped_points > 0) removeDropped(scan, plan.fates, cloud);
+  }
+  return result;
+}
+
+std::optional<Transform> vehicleMotion(const PoseBuffer& odometry, StampNs from_ns, StampNs to_ns) {
+  const std::optional<Transform> T_fixed_from = odometry.lookup(from_ns);
+  const std::optional<Transform> T_fixed_to = odometry.lookup(to_ns);
+  if (!T_fixed_from || !T_fixed_to) return std::nullopt;
+  return relative(*T_fixed_to, *T_fixed_from);
+}
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,257 @@
+// SPDX-License-Identifier: MIT
+#include "semantic_lidar_fusion/superpixel/uncertainty.h"
+
+#include <algorithm>
+#include <cmath>
+#include <string>
+
+#include "semantic_lidar_fusion/common/error.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+constexpr int kNoVote = -1;
+
+std::string sizeText(int width, int height) {
+  return std::to_string(width) + "x" + std::to_string(height);
+}
+
+void checkClassCount(int class_count) {
+  if (class_count < 1 || class_count > CV_CN_MAX) {
+    throw DataError("class count is " + std::to_string(class_count) + ", must be 1.." +
+                    std::to_string(CV_CN_MAX));
+  }
+}
+
+/// Cell of the source grid under each of `count` target positions along one axis.
+std::vector<int> cellsUnderCentres(int count, int source_count) {
+  std::vector<int> cells(count);
+  for (int i = 0; i < count; ++i) cells[i] = cellUnderCentre(i, count, source_count);
+  return cells;
+}
+
+/// Votes per superpixel and class, and their sums.
+struct Histogram {
+  Histogram(int superpixel_count, int class_count)
+      : class_count(class_count),
+        votes(static_cast<std::size_t>(superpixel_count) * class_count),
+        totals(superpixel_count) {}
+
+  void add(int superpixel, int label) {
+    ++votes[static_cast<std::size_t>(superpixel) * class_count + label];
+    ++totals[superpixel];
+  }
+  const int* of(int superpixel) const {
+    return &votes[static_cast<std::size_t>(superpixel) * class_count];
+  }
+
+  int class_count;
+  std::vector<int> votes;
+  std::vector<int> totals;
+};
+
+/// Lets every pixel of the map vote. `label_of(column, row)` is the label of a source cell, or
+/// kNoVote; it is asked once per needed cell of a source row. Returns the votes withheld.
+template <typename LabelOf>
+std::size_t vote(const SuperpixelMap& superpixels, const ImageSize& source, const LabelOf& label_of,
+                 Histogram* histogram) {
+  const cv::Mat& ids = superpixels.ids;
+  const std::vector<int> columns = cellsUnderCentres(ids.cols, source.width);
+  const std::vector<int> rows = cellsUnderCentres(ids.rows, source.height);
+  std::vector<int> labels(ids.cols);
+  std::size_t withheld = 0;
+  for (int y = 0; y < ids.rows; ++y) {
+    if (y == 0 || rows[y] != rows[y - 1]) {
+      for (int x = 0; x < ids.cols; ++x) {
+        labels[x] =
+            x > 0 && columns[x] == columns[x - 1] ? labels[x - 1] : label_of(columns[x], rows[y]);
+      }
+    }
+    const int* id = ids.ptr<int>(y);
+    for (int x = 0; x < ids.cols; ++x) {
+      if (labels[x] == kNoVote) {
+        ++withheld;
+      } else {
+        histogram->add(id[x], labels[x]);
+      }
+    }
+  }
+  return withheld;
+}
+
+void fillUniform(int class_count, double* probabilities) {
+  std::fill_n(probabilities, class_count, 1.0 / class_count);
+}
+
+/// 1 / tau (eq. 4).
+double inverseTemperature(double share, const UncertaintyConfig& config) {
+  const double power = config.exponent == 2.0 ? share * share : std::pow(share, config.exponent);
+  return power / config.temperature;
+}
+
+}  // namespace
+
+ScoreMap::ScoreMap(const cv::Mat& scores, int class_count, const ScoreFormat& format)
+    : scores_(scores), format_(format) {
+  if (scores.empty() || scores.dims != 2) {
+    throw DataError("score image is empty or not two-dimensional, must be rows x columns");
+  }
+  if (scores.depth() != CV_32F && scores.depth() != CV_16U && scores.depth() != CV_8U) {
+    throw DataError("score image has OpenCV depth " + std::to_string(scores.depth()) +
+                    ", must be 32F, 16U or 8U");
+  }
+  if (scores.channels() != class_count) {
+    throw DataError("score image has " + std::to_string(scores.channels()) +
+                    " channels, must have one per class: " + std::to_string(class_count));
+  }
+}
+
+bool ScoreMap::read(int column, int row, float* out) const {
+  const int count = scores_.channels();
+  const std::size_t first = static_cast<std::size_t>(column) * count;
+  bool finite = true;
+  const auto convert = [&](const auto* cell) {
+    for (int c = 0; c < count; ++c) {
+      out[c] = static_cast<float>(format_.scale * cell[c] + format_.offset);
+      finite = finite && std::isfinite(out[c]);
+    }
+  };
+  switch (scores_.depth()) {
+    case CV_8U:
+      convert(scores_.ptr<std::uint8_t>(row) + first);
+      break;
+    case CV_16U:
+      convert(scores_.ptr<std::uint16_t>(row) + first);
+      break;
+    default: {
+      const float* cell = scores_.ptr<float>(row) + first;
+      for (int c = 0; c < count; ++c) {
+        out[c] = cell[c];
+        finite = finite && std::isfinite(cell[c]);
+      }
+    }
+  }
+  return finite;
+}
+
+ShareMap computeShare(const SuperpixelMap& superpixels, const ScoreMap& scores) {
+  if (scores.empty()) throw DataError("score map is empty, must have at least one cell");
+  const int class_count = scores.classCount();
+  std::vector<float> cell(class_count);
+  const auto label_of = [&](int column, int row) {
+    if (!scores.read(column, row, cell.data())) return kNoVote;
+    // max_element returns the first of equal scores: the lowest id.
+    return static_cast<int>(std::max_element(cell.begin(), cell.end()) - cell.begin());
+  };
+
+  ShareMap result;
+  Histogram histogram(superpixels.count, class_count);
+  result.nonfinite_cells = vote(superpixels, scores.size(), label_of, &histogram);
+
+  result.superpixel.resize(superpixels.count);
+  for (int k = 0; k < superpixels.count; ++k) {
+    const int* votes = histogram.of(k);
+    const int most = *std::max_element(votes, votes + class_count);
+    // A superpixel without votes has only uniform cells: any temperature leaves them so.
+    result.superpixel[k] =
+        histogram.totals[k] == 0
+            ? 1.0F
+            : static_cast<float>(static_cast<double>(most) / histogram.totals[k]);
+  }
+
+  result.share.create(superpixels.ids.size(), CV_32FC1);
+  for (int y = 0; y < superpixels.ids.rows; ++y) {
+    const int* id = superpixels.ids.ptr<int>(y);
+    float* share = result.share.ptr<float>(y);
+    for (int x = 0; x < superpixels.ids.cols; ++x) share[x] = result.superpixel[id[x]];
+  }
+  return result;
+}
+
+bool temperedSoftmax(const float* scores, int class_count, double share,
+                     const UncertaintyConfig& config, double* probabilities) {
+  if (class_count < 1) return false;
+  bool valid = share > 0.0 && share <= 1.0;
+  for (int c = 0; c < class_count; ++c) valid = valid && std::isfinite(scores[c]);
+  if (!valid) {
+    fillUniform(class_count, probabilities);
+    return false;
+  }
+  const double inverse_tau = inverseTemperature(share, config);
+  const double highest = *std::max_element(scores, scores + class_count);
+  double sum = 0.0;
+  for (int c = 0; c < class_count; ++c) {
+    const double below = scores[c] - highest;
+    // The highest has exponent 0 whatever the temperature, also where 1 / tau overflows.
+    probabilities[c] = below == 0.0 ? 1.0 : std::exp(below * inverse_tau);
+    sum += probabilities[c];
+  }
+  for (int c = 0; c < class_count; ++c) probabilities[c] /= sum;
+  return true;
+}
+
+cv::Mat denseProbabilities(const ScoreMap& scores, const cv::Mat& share,
+                           const UncertaintyConfig& config) {
+  if (scores.empty()) throw DataError("score map is empty, must have at least one cell");
+  if (share.empty() || share.type() != CV_32FC1) {
+    throw DataError("share image is " + sizeText(share.cols, share.rows) + " of OpenCV type " +
+                    std::to_string(share.type()) + ", must be non-empty 32FC1");
+  }
+  const int class_count = scores.classCount();
+  const std::vector<int> columns = cellsUnderCentres(share.cols, scores.size().width);
+  const std::vector<int> rows = cellsUnderCentres(share.rows, scores.size().height);
+  std::vector<float> cell(class_count);
+  std::vector<double> distribution(class_count);
+  cv::Mat result(share.size(), CV_32FC(class_count));
+  for (int y = 0; y < share.rows; ++y) {
+    const float* share_row = share.ptr<float>(y);
+    float* out = result.ptr<float>(y);
+    for (int x = 0; x < share.cols; ++x, out += class_count) {
+      const bool repeated =
+          x > 0 && columns[x] == columns[x - 1] && share_row[x] == share_row[x - 1];
+      if (!repeated) {
+        scores.read(columns[x], rows[y], cell.data());
+        temperedSoftmax(cell.data(), class_count, share_row[x], config, distribution.data());
+      }
+      std::copy(distribution.begin(), distribution.end(), out);
+    }
+  }
+  return result;
+}
+
+cv::Mat histogramProbabilities(const SuperpixelMap& superpixels, const cv::Mat& labels,
+                               int class_count) {
+  checkClassCount(class_count);
+  if (labels.empty() || labels.type() != CV_8UC1) {
+    throw DataError("label image is " + sizeText(labels.cols, labels.rows) + " of OpenCV type " +
+                    std::to_string(labels.type()) + ", must be non-empty 8UC1 (mono8)");
+  }
+  const auto label_of = [&](int column, int row) {
+    const int label = labels.ptr<std::uint8_t>(row)[column];
+    return label < class_count ? label : kNoVote;
+  };
+  Histogram histogram(superpixels.count, class_count);
+  vote(superpixels, {labels.cols, labels.rows}, label_of, &histogram);
+
+  std::vector<float> probabilities(histogram.votes.size());
+  for (int k = 0; k < superpixels.count; ++k) {
+    const int* votes = histogram.of(k);
+    float* out = &probabilities[static_cast<std::size_t>(k) * class_count];
+    for (int c = 0; c < class_count; ++c) {
+      out[c] = static_cast<float>(histogram.totals[k] == 0
+                                      ? 1.0 / class_count
+                                      : static_cast<double>(votes[c]) / histogram.totals[k]);
+    }
+  }
+  cv::Mat result(superpixels.ids.size(), CV_32FC(class_count));
+  for (int y = 0; y < result.rows; ++y) {
+    const int* id = superpixels.ids.ptr<int>(y);
+    float* out = result.ptr<float>(y);
+    for (int x = 0; x < result.cols; ++x, out += class_count) {
+      std::copy_n(&probabilities[static_cast<std::size_t>(id[x]) * class_count], class_count, out);
+    }
+  }
+  return result;
+}
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: MIT
+"""Launch files, YAML files, plugin descriptions and test files hold together."""
+
+import glob
+import os
+import re
+import subprocess
+import xml.etree.ElementTree as ET
+
+import pytest
+import yaml
+
+SOURCE_DIR = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))
+
+
+def files(pattern):
+    return sorted(glob.glob(os.path.join(SOURCE_DIR, pattern), recursive=True))
+
+
+def text_of(path):
+    with open(path, encoding="utf-8") as file:
+        return file.read()
+
+
+class UniqueKeys(yaml.SafeLoader):
+    """YAML lets the last of two equal keys win; here they are an error."""
+
+    def construct_mapping(self, node, deep=False):
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        twice = {str(key) for key in keys if keys.count(key) > 1}
+        if twice:
+            raise yaml.YAMLError("%s: key %s stands twice" % (node.start_mark, sorted(twice)))
+        return super().construct_mapping(node, deep)
+
+
+def test_yaml_files_parse():
+    for path in files("config/**/*.yaml"):
+        assert yaml.load(text_of(path), Loader=UniqueKeys) is not None, "%s is empty" % path
+
+
+def test_a_repeated_key_is_seen():
+    with pytest.raises(yaml.YAMLError):
+        yaml.load("a: 1\na: 2\n", Loader=UniqueKeys)
+
+
+def test_xml_files_parse():
+    for path in files("launch/**/*.launch") + files("nodelets/*.xml") + files("*.xml"):
+        ET.fromstring(text_of(path).encode("utf-8"))
+
+
+def test_files_that_launch_files_name_exist():
+    own = re.compile(r"\$\(find semantic_lidar_fusion\)/([\w./-]+\.\w+)")
+    for path in files("launch/**/*.launch"):
+        for name in own.findall(text_of(path)):
+            assert os.path.exists(os.path.join(SOURCE_DIR, name)), "%s: no %s" % (path, name)
+
+
+def test_plugin_descriptions_match_the_exports():
+    """Each class in nodelet_plugins.xml is exported by exactly one source and the other way round."""
+    described = []
+    for path in files("nodelets/nodelet_plugins.xml"):
+        root = ET.fromstring(text_of(path).encode("utf-8"))
+        libraries = [root] if root.tag == "library" else root.findall("library")
+        for library in libraries:
+            assert library.get("path") == "lib/libsemantic_lidar_fusion_nodelets"
+            for plugin in library.findall("class"):
+                assert plugin.get("base_class_type") == "nodelet::Nodelet"
+                assert (plugin.findtext("description") or "").strip(), plugin.get("name")
+                described.append(plugin.get("type"))
+    exported = []
+    macro = re.compile(r"PLUGINLIB_EXPORT_CLASS\(\s*([\w:]+)\s*,\s*nodelet::Nodelet\s*\)")
+    for path in files("nodelets/*.cpp"):
+        exported += macro.findall(text_of(path))
+    assert sorted(described) == sorted(exported)
+
+
+def test_rostests_cannot_pass_by_default():
+    """What rostest would forgive is not written: no <test>, no limit, a required node."""
+    for path in files("test/ros/**/*.test"):
+        root = ET.fromstring(text_of(path).encode("utf-8"))
+        tests = list(root.iter("test"))
+        assert tests, "%s holds no <test>" % path
+        for test in tests:
+            assert test.get("time-limit"), "%s: a <test> has no time-limit" % path
+            assert "$(" not in test.get("test-name", ""), "%s: computed test-name" % path
+        for node in root.iter("node"):
+            assert node.get("required") is None, "%s: a required node ends the test" % path
+
+
+def test_unit_tests_lie_where_the_build_finds_them():
+    stray = [
+        path
+        for path in files("test/unit/**/*.cpp")
+        if len(os.path.relpath(path, SOURCE_DIR).split(os.sep)) != 4
+    ]
+    assert not stray, "not in test/unit/<room>/: %s" % stray
+
+
+def test_shell_scripts_parse_and_installed_scripts_name_the_system_python():
+    for path in (
+        files("scripts/*.sh") + files("test/shell/*.sh") + [os.path.join(SOURCE_DIR, ".ci", "run")]
+    ):
+        subprocess.run(["/bin/bash", "-n", path], check=True)
+    for path in files("scripts/*.py"):
+        assert text_of(path).startswith("#!/usr/bin/python3\n"), path
+        assert os.access(path, os.X_OK), "%s is not executable" % path

@@ -1,0 +1,606 @@
+// SPDX-License-Identifier: MIT
+#include <gtest/gtest.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <fstream>
+#include <iostream>
+#include <iterator>
+#include <map>
+#include <random>
+#include <string>
+#include <vector>
+
+#include "npz.h"
+#include "optional_data.h"
+#include "packet_encoder.h"
+#include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/lidar/packet_decoder.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+constexpr double kPi = 3.14159265358979323846;
+constexpr StampNs kStart = 1673400472138016708;
+
+struct Point {
+  double x = 0.0, y = 0.0, z = 0.0;
+  int intensity = 0;
+  int ring = 0;
+  StampNs time_ns = 0;
+};
+
+Point at(const TimedCloud& cloud, std::size_t i) {
+  return {cloud.x[i],    cloud.y[i],      cloud.z[i], static_cast<int>(cloud.intensity[i]),
+          cloud.ring[i], cloud.time_ns[i]};
+}
+
+double distance(const Point& a, const Point& b) {
+  return std::sqrt((a.x - b.x) * (a.x - b.x) + (a.y - b.y) * (a.y - b.y) +
+                   (a.z - b.z) * (a.z - b.z));
+}
+
+/// A world of random echoes on the raw distance grid, and what must come out of it, in order.
+struct RandomWorld {
+  RandomWorld(const PacketEncoder& encoder, bool dual, unsigned seed)
+      : unit_m(encoder.unitM()), dual_return(dual), random(seed) {}
+
+  Echoes operator()(const Shot& shot) {
+    std::uniform_int_distribution<int> raw(250, 12500);
+    std::uniform_int_distribution<int> intensity(0, 255);
+    std::uniform_int_distribution<int> kind(0, 9);
+    Echoes echoes;
+    const int k = kind(random);
+    if (k > 0) echoes.first = {raw(random) * unit_m, static_cast<std::uint8_t>(intensity(random))};
+    if (k > 5) echoes.second = {raw(random) * unit_m, static_cast<std::uint8_t>(intensity(random))};
+    if (k > 0) first.push_back(pointOf(shot, echoes.first));
+    if (k > 5) second.push_back(pointOf(shot, echoes.second));
+    return echoes;
+  }
+  /// Points of one block pair, in the order packet, block, firing, laser.
+  std::vector<Point> take() {
+    std::vector<Point> points = std::move(first);
+    if (dual_return) points.insert(points.end(), second.begin(), second.end());
+    first.clear();
+    second.clear();
+    return points;
+  }
+  static Point pointOf(const Shot& shot, const Echo& echo) {
+    return {echo.range_m * shot.direction_x(),
+            echo.range_m * shot.direction_y(),
+            echo.range_m * shot.direction_z(),
+            echo.intensity,
+            shot.ring,
+            shot.time_ns};
+  }
+
+  double unit_m;
+  bool dual_return;
+  std::mt19937 random;
+  std::vector<Point> first;
+  std::vector<Point> second;
+};
+
+struct Scan {
+  std::vector<Packet> packets;
+  std::vector<Point> truth;
+};
+
+Scan makeScan(const PacketEncoder::Config& config, int packet_count, unsigned seed = 1) {
+  PacketEncoder encoder(config);
+  RandomWorld world(encoder, config.dual_return, seed);
+  // Block by block the order of points differs from the order of shots only with dual returns.
+  Scan scan;
+  const auto flush = [&] {
+    const std::vector<Point> points = world.take();
+    scan.truth.insert(scan.truth.end(), points.begin(), points.end());
+  };
+  const int shots_per_block = 32;
+  int shots = 0;
+  for (int i = 0; i < packet_count; ++i) {
+    scan.packets.push_back(encoder.next([&](const Shot& shot) {
+      if (shots++ % shots_per_block == 0) flush();
+      return world(shot);
+    }));
+  }
+  flush();
+  return scan;
+}
+
+/// Rotation by whole hundredths of a degree from block to block, so that azimuths are sent exactly.
+double exactRotationHz(LidarModel model, bool dual) {
+  PacketEncoder::Config config;
+  config.model = model;
+  config.dual_return = dual;
+  const PacketEncoder encoder(config);
+  const double block_s = toSeconds(encoder.packetNs()) / (dual ? 6.0 : 12.0);
+  return 0.4 / 360.0 / block_s;
+}
+
+void expectSame(const TimedCloud& cloud, const std::vector<Point>& truth, double angle_rad) {
+  ASSERT_EQ(cloud.size(), truth.size());
+  for (std::size_t i = 0; i < truth.size(); ++i) {
+    const Point point = at(cloud, i);
+    const double range = distance(truth[i], Point());
+    ASSERT_LT(distance(point, truth[i]), range * angle_rad + 1e-5) << "point " << i;
+    ASSERT_EQ(point.intensity, truth[i].intensity) << i;
+    ASSERT_EQ(point.ring, truth[i].ring) << i;
+    ASSERT_EQ(point.time_ns, truth[i].time_ns) << i;
+  }
+}
+
+class EveryModel : public ::testing::TestWithParam<std::tuple<LidarModel, bool>> {
+ protected:
+  PacketEncoder::Config config() const {
+    PacketEncoder::Config config;
+    config.model = std::get<0>(GetParam());
+    config.dual_return = std::get<1>(GetParam());
+    config.start_ns = kStart;
+    return config;
+  }
+};
+
+INSTANTIATE_TEST_SUITE_P(
+    PacketDecoder, EveryModel,
+    ::testing::Combine(::testing::Values(LidarModel::kVlp16, LidarModel::kPuckHiRes,
+                                         LidarModel::kVlp32c, LidarModel::kHdl32e),
+                       ::testing::Bool()));
+
+TEST_P(EveryModel, GivesBackTheWorldAcrossTheFullTurn) {
+  // Float coordinates at 50 m have steps of 4e-6 m: within 1e-5 m.
+  PacketEncoder::Config config = this->config();
+  config.rotation_hz = exactRotationHz(config.model, config.dual_return);
+  config.start_azimuth_deg = 340.0;
+  const Scan scan = makeScan(config, 20);
+  const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, kStart + 7, "velodyne");
+  EXPECT_EQ(decoded.cloud.frame_id, "velodyne");
+  EXPECT_EQ(decoded.cloud.header_stamp, kStart + 7);
+  EXPECT_EQ(decoded.counters.packets, 20u);
+  EXPECT_EQ(decoded.counters.bad_blocks, 0u);
+  EXPECT_TRUE(decoded.counters.unknown_packets.empty());
+  expectSame(decoded.cloud, scan.truth, 0.0);
+}
+
+TEST_P(EveryModel, StaysWithinTheAzimuthsResolutionAtAnySpeed) {
+  // A block's azimuth is off by up to 0.005 deg; behind the last block the previous difference adds
+  // up to 0.01 deg.
+  PacketEncoder::Config config = this->config();
+  for (const double hz : {5.0, 10.0, 20.0}) {
+    config.rotation_hz = hz;
+    config.start_azimuth_deg = 123.456;
+    const Scan scan = makeScan(config, 20);
+    const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, kStart, "velodyne");
+    expectSame(decoded.cloud, scan.truth, 0.0151 * kPi / 180.0);
+  }
+}
+
+TEST_P(EveryModel, GroupsPointsToTheirFirings) {
+  PacketEncoder::Config config = this->config();
+  const Scan scan = makeScan(config, 5);
+  const TimedCloud cloud = PacketDecoder({}).decode(scan.packets, kStart, "velodyne").cloud;
+  ASSERT_FALSE(cloud.firings.empty());
+  std::vector<Firing> seen = cloud.firings;
+  for (Firing& firing : seen) std::swap(firing.begin_ns, firing.end_ns);
+  const PacketEncoder encoder(config);
+  for (std::size_t i = 0; i < cloud.size(); ++i) {
+    ASSERT_LT(cloud.firing[i], cloud.firings.size());
+    const Firing& firing = cloud.firings[cloud.firing[i]];
+    ASSERT_LE(firing.begin_ns, cloud.time_ns[i]);
+    ASSERT_GE(firing.end_ns, cloud.time_ns[i]);
+    ASSERT_LT(firing.end_ns - firing.begin_ns, 36864);
+    ASSERT_EQ(static_cast<StampNs>(firing.packet),
+              (cloud.time_ns[i] - kStart) / encoder.packetNs());
+    Firing& mine = seen[cloud.firing[i]];
+    mine.begin_ns = std::min(mine.begin_ns, cloud.time_ns[i]);
+    mine.end_ns = std::max(mine.end_ns, cloud.time_ns[i]);
+  }
+  for (std::size_t k = 0; k < seen.size(); ++k) {
+    ASSERT_EQ(seen[k].begin_ns, cloud.firings[k].begin_ns);
+    ASSERT_EQ(seen[k].end_ns, cloud.firings[k].end_ns);
+  }
+}
+
+/// A packet written byte by byte from the manual's figures, without the encoder.
+Packet vlp16Packet(std::uint8_t mode = 0x37, std::uint8_t factory = 0x22) {
+  Packet packet;
+  packet.stamp = kStart;
+  for (int b = 0; b < 12; ++b) {
+    std::uint8_t* const block = packet.data.data() + 100 * b;
+    block[0] = 0xFF;
+    block[1] = 0xEE;
+    const int azimuth = (35900 + 40 * b) % 36000;
+    block[2] = static_cast<std::uint8_t>(azimuth & 0xFF);
+    block[3] = static_cast<std::uint8_t>(azimuth >> 8);
+  }
+  packet.data[1204] = mode;
+  packet.data[1205] = factory;
+  return packet;
+}
+
+void setReturn(Packet& packet, int block, int index, int raw, std::uint8_t intensity) {
+  std::uint8_t* const data = packet.data.data() + 100 * block + 4 + 3 * index;
+  data[0] = static_cast<std::uint8_t>(raw & 0xFF);
+  data[1] = static_cast<std::uint8_t>(raw >> 8);
+  data[2] = intensity;
+}
+
+TEST(PacketDecoder, ReadsAPacketWrittenByHand) {
+  Packet packet = vlp16Packet();
+  setReturn(packet, 0, 0, 5000, 11);        // laser 0, -15 deg, 10 m
+  setReturn(packet, 2, 16 + 3, 10000, 22);  // second firing, laser 3, +3 deg, 20 m, 359.8 deg
+  setReturn(packet, 11, 31, 500, 33);       // the last one, laser 15, +15 deg, 1 m
+  const TimedCloud cloud = PacketDecoder({}).decode({packet}, kStart, "velodyne").cloud;
+  ASSERT_EQ(cloud.size(), 3u);
+  const auto expect = [&](std::size_t i, double d, double azimuth_deg, double elevation_deg,
+                          int ring, int intensity, double time_us) {
+    const double az = azimuth_deg * kPi / 180.0;
+    const double el = elevation_deg * kPi / 180.0;
+    EXPECT_NEAR(cloud.x[i], d * std::cos(el) * std::cos(az), 2e-6);
+    EXPECT_NEAR(cloud.y[i], -d * std::cos(el) * std::sin(az), 2e-6);
+    EXPECT_NEAR(cloud.z[i], d * std::sin(el), 2e-6);
+    EXPECT_EQ(cloud.ring[i], ring);
+    EXPECT_EQ(cloud.intensity[i], static_cast<float>(intensity));
+    EXPECT_EQ(cloud.time_ns[i] - kStart, std::llround(time_us * 1e3));
+  };
+  expect(0, 10.0, 359.0, -15.0, 0, 11, 0.0);
+  expect(1, 20.0, 359.8 + 0.4 * (55.296 + 3 * 2.304) / 110.592, 3.0, 9, 22, 5 * 55.296 + 3 * 2.304);
+  expect(2, 1.0, 3.4 + 0.4 * (55.296 + 15 * 2.304) / 110.592, 15.0, 15, 33,
+         23 * 55.296 + 15 * 2.304);
+}
+
+TEST(PacketDecoder, DropsASecondReturnThatEqualsTheFirst) {
+  Packet packet = vlp16Packet(0x39);
+  for (int b = 1; b < 12; b += 2) {  // pairs share an azimuth
+    packet.data[100 * b + 2] = packet.data[100 * (b - 1) + 2];
+    packet.data[100 * b + 3] = packet.data[100 * (b - 1) + 3];
+  }
+  setReturn(packet, 2, 5, 4000, 50);
+  setReturn(packet, 3, 5, 4000, 50);  // equal
+  setReturn(packet, 2, 6, 4000, 50);
+  setReturn(packet, 3, 6, 3000, 50);  // another range
+  setReturn(packet, 5, 7, 2000, 50);  // a second one without a first
+  const DecodedScan scan = PacketDecoder({}).decode({packet}, kStart, "velodyne");
+  ASSERT_EQ(scan.cloud.size(), 4u);
+  EXPECT_EQ(scan.counters.equal_returns, 1u);
+  EXPECT_NEAR(scan.cloud.z[2], 6.0 * std::sin(-9.0 * kPi / 180.0), 1e-6);
+  EXPECT_EQ(scan.cloud.time_ns[1], scan.cloud.time_ns[2]) << "one firing, two returns";
+  // The difference counts from pair to pair: 0.8 deg in 110.592 us.
+  const double azimuth = (359.8 + 0.8 * (6 * 2.304) / 110.592) * kPi / 180.0;
+  EXPECT_NEAR(std::atan2(-scan.cloud.y[1], scan.cloud.x[1]), azimuth - 2.0 * kPi, 1e-6);
+}
+
+TEST(PacketDecoder, TakesTheModelFromTheFactoryByteUnlessItIsGiven) {
+  Packet packet = vlp16Packet();
+  setReturn(packet, 0, 0, 1000, 1);
+  const auto lowest = [&](std::uint8_t factory, std::optional<LidarModel> model) {
+    packet.data[1205] = factory;
+    PacketDecoderConfig config;
+    config.model = model;
+    const TimedCloud cloud = PacketDecoder(config).decode({packet}, kStart, "v").cloud;
+    const double d = std::hypot(std::hypot(cloud.x.at(0), cloud.y.at(0)), cloud.z.at(0));
+    return std::make_pair(std::asin(cloud.z.at(0) / d) * 180.0 / kPi, d);
+  };
+  const auto near = [](std::pair<double, double> value, double elevation_deg, double range_m) {
+    EXPECT_NEAR(value.first, elevation_deg, 1e-4);
+    EXPECT_NEAR(value.second, range_m, 1e-6);
+  };
+  near(lowest(0x22, std::nullopt), -15.0, 2.0);
+  near(lowest(0x24, std::nullopt), -10.0, 2.0);
+  near(lowest(0x28, std::nullopt), -25.0, 4.0);
+  near(lowest(0x21, std::nullopt), -30.67, 2.0);
+  near(lowest(0x22, LidarModel::kPuckHiRes), -10.0, 2.0);
+  near(lowest(0x77, LidarModel::kHdl32e), -30.67, 2.0);
+}
+
+TEST(PacketDecoder, CountsUnknownPacketsAndNamesTheByte) {
+  Packet good = vlp16Packet();
+  setReturn(good, 0, 0, 1000, 1);
+  Packet sensor = good;
+  sensor.stamp += 1;
+  sensor.data[1205] = 0xA1;
+  Packet mode = good;
+  mode.stamp += 2;
+  mode.data[1204] = 0x3C;
+  const DecodedScan scan = PacketDecoder({}).decode({sensor, good, mode}, kStart, "velodyne");
+  EXPECT_EQ(scan.cloud.size(), 1u);
+  ASSERT_EQ(scan.counters.unknown_packets.size(), 2u);
+  const auto first = scan.counters.unknown_packets.begin();
+  EXPECT_NE(first->first.find("factory byte 0xA1"), std::string::npos) << first->first;
+  EXPECT_EQ(first->second, 1u);
+  EXPECT_NE(std::next(first)->first.find("return mode byte 0x3C"), std::string::npos);
+}
+
+TEST(PacketDecoder, BadBlocksAreSkippedAndHarmNoOther) {
+  PacketEncoder::Config config;
+  config.start_ns = kStart;
+  config.rotation_hz = exactRotationHz(config.model, false);
+  const Scan scan = makeScan(config, 3);
+  std::vector<Packet> packets = scan.packets;
+  packets[1].data[100 * 4] = 0;          // flag
+  packets[1].data[100 * 5 + 3] = 0xFF;   // azimuth 65 xxx
+  packets[2].data[100 * 11 + 1] = 0x00;  // the last block
+  const DecodedScan decoded = PacketDecoder({}).decode(packets, kStart, "velodyne");
+  EXPECT_EQ(decoded.counters.bad_blocks, 3u);
+  const auto inBadBlock = [&](const Point& point) {
+    const StampNs block = (point.time_ns - kStart) / 110592;
+    return block == 12 + 4 || block == 12 + 5 || block == 24 + 11;
+  };
+  std::vector<Point> truth = scan.truth;
+  truth.erase(std::remove_if(truth.begin(), truth.end(), inBadBlock), truth.end());
+  ASSERT_LT(truth.size(), scan.truth.size());
+  expectSame(decoded.cloud, truth, 0.0);
+}
+
+TEST(PacketDecoder, ALoneBlockGoesOnTurningAsThePacketBefore) {
+  PacketEncoder::Config config;
+  config.start_ns = kStart;
+  config.rotation_hz = exactRotationHz(config.model, false);
+  const Scan scan = makeScan(config, 2);
+  std::vector<Packet> packets = scan.packets;
+  for (int b = 1; b < 12; ++b) packets[1].data[100 * b] = 0;
+  std::vector<Point> truth = scan.truth;
+  truth.erase(std::remove_if(truth.begin(), truth.end(),
+                             [](const Point& p) { return p.time_ns >= kStart + 1327104 + 110592; }),
+              truth.end());
+  expectSame(PacketDecoder({}).decode(packets, kStart, "velodyne").cloud, truth, 0.0);
+}
+
+TEST(PacketDecoder, ShuffledDuplicatedMissingAndEmptyPacketsLeaveTheRestAsItIs) {
+  PacketEncoder::Config config;
+  config.start_ns = kStart;
+  const Scan scan = makeScan(config, 76);
+  std::mt19937 random(4);
+  std::vector<Packet> surviving;
+  for (const Packet& packet : scan.packets) {
+    if (random() % 10 != 0) surviving.push_back(packet);
+  }
+  ASSERT_LT(surviving.size(), scan.packets.size());
+  const DecodedScan clean = PacketDecoder({}).decode(surviving, kStart, "velodyne");
+
+  std::vector<Packet> dirty = surviving;
+  std::size_t duplicates = 0;
+  std::size_t zeros = 0;
+  for (const Packet& packet : surviving) {
+    if (random() % 5 == 0) {
+      dirty.push_back(packet);
+      ++duplicates;
+    }
+    if (random() % 7 == 0) {
+      Packet zero;
+      zero.stamp = packet.stamp + 5;
+      dirty.push_back(zero);
+      ++zeros;
+    }
+  }
+  std::shuffle(dirty.begin(), dirty.end(), random);
+  const DecodedScan decoded = PacketDecoder({}).decode(dirty, kStart, "velodyne");
+  EXPECT_EQ(decoded.counters.duplicate_packets, duplicates);
+  EXPECT_EQ(decoded.counters.zero_packets, zeros);
+  EXPECT_EQ(decoded.counters.packets, dirty.size());
+  EXPECT_EQ(decoded.cloud.x, clean.cloud.x);
+  EXPECT_EQ(decoded.cloud.y, clean.cloud.y);
+  EXPECT_EQ(decoded.cloud.z, clean.cloud.z);
+  EXPECT_EQ(decoded.cloud.time_ns, clean.cloud.time_ns);
+  EXPECT_EQ(decoded.cloud.firing, clean.cloud.firing);
+}
+
+TEST(PacketDecoder, AStampTellsThePacketsStartMiddleOrEnd) {
+  for (const bool dual : {false, true}) {
+    Packet packet = vlp16Packet(dual ? 0x39 : 0x37);
+    setReturn(packet, 0, 0, 1000, 1);
+    const StampNs duration = dual ? 663552 : 1327104;
+    const auto first = [&](PacketStamp stamp, StampNs offset) {
+      PacketDecoderConfig config;
+      config.packet_stamp = stamp;
+      config.time_offset_ns = offset;
+      return PacketDecoder(config).decode({packet}, kStart, "velodyne").cloud.time_ns.at(0);
+    };
+    EXPECT_EQ(first(PacketStamp::kStart, 0), kStart);
+    EXPECT_EQ(first(PacketStamp::kMiddle, 0), kStart - duration / 2);
+    EXPECT_EQ(first(PacketStamp::kEnd, 0), kStart - duration);
+    EXPECT_EQ(first(PacketStamp::kStart, -12345), kStart - 12345);
+  }
+}
+
+TEST(PacketDecoder, RangeLimitsConcernTheMeasuredRange) {
+  Packet packet = vlp16Packet();
+  setReturn(packet, 0, 0, 499, 1);
+  setReturn(packet, 0, 1, 500, 2);
+  setReturn(packet, 0, 2, 1000, 3);
+  setReturn(packet, 0, 3, 1001, 4);
+  PacketDecoderConfig config;
+  config.min_range_m = 1.0;
+  config.max_range_m = 2.0;
+  const DecodedScan scan = PacketDecoder(config).decode({packet}, kStart, "velodyne");
+  EXPECT_EQ(scan.cloud.intensity, (std::vector<float>{2.0f, 3.0f}));
+  EXPECT_EQ(scan.counters.out_of_range_points, 2u);
+}
+
+TEST(PacketDecoder, VerticalOffsetsGoByRing) {
+  Packet packet = vlp16Packet();
+  setReturn(packet, 0, 1, 1000, 1);  // ring 8
+  PacketDecoderConfig config;
+  const float plain = PacketDecoder(config).decode({packet}, kStart, "v").cloud.z.at(0);
+  for (int ring = 0; ring < 16; ++ring) config.vertical_offsets_m.push_back(0.001 * ring);
+  const float moved = PacketDecoder(config).decode({packet}, kStart, "v").cloud.z.at(0);
+  EXPECT_NEAR(moved - plain, 0.008, 1e-6);
+
+  packet.data[1205] = 0x28;
+  const DecodedScan wrong = PacketDecoder(config).decode({packet}, kStart, "v");
+  EXPECT_TRUE(wrong.cloud.empty());
+  ASSERT_EQ(wrong.counters.unknown_packets.size(), 1u);
+  EXPECT_NE(wrong.counters.unknown_packets.begin()->first.find("16 entries"), std::string::npos);
+}
+
+TEST(PacketDecoder, RefusesABadConfigurationWithEveryProblem) {
+  PacketDecoderConfig config;
+  config.model = LidarModel::kVlp16;
+  config.min_range_m = -1.0;
+  config.max_range_m = std::nan("");
+  config.vertical_offsets_m.resize(32);
+  try {
+    PacketDecoder decoder(config);
+    FAIL();
+  } catch (const ConfigError& error) {
+    EXPECT_EQ(error.problems().size(), 3u);
+  }
+}
+
+TEST(PacketDecoder, NoPacketsGiveAnEmptyCloud) {
+  const DecodedScan scan = PacketDecoder({}).decode({}, 42, "velodyne");
+  EXPECT_TRUE(scan.cloud.empty());
+  EXPECT_EQ(scan.cloud.header_stamp, 42);
+  EXPECT_TRUE(scan.cloud.firings.empty());
+}
+
+TEST(PacketDecoder, SurvivesRandomBytes) {
+  std::mt19937 random(9);
+  for (int round = 0; round < 3000; ++round) {
+    Packet packet = vlp16Packet();
+    packet.stamp = static_cast<StampNs>(random());
+    if (round % 2 == 0) {
+      for (std::uint8_t& byte : packet.data) byte = static_cast<std::uint8_t>(random());
+    }
+    for (int i = 0; i < 300; ++i) {
+      packet.data[random() % 1200] = static_cast<std::uint8_t>(random());
+    }
+    const std::uint8_t modes[] = {0x37, 0x38, 0x39};
+    const std::uint8_t models[] = {0x21, 0x22, 0x24, 0x28};
+    packet.data[1204] = modes[random() % 3];
+    packet.data[1205] = models[random() % 4];
+    const TimedCloud cloud = PacketDecoder({}).decode({packet}, kStart, "velodyne").cloud;
+    for (std::size_t i = 0; i < cloud.size(); ++i) {
+      ASSERT_TRUE(std::isfinite(cloud.x[i]) && std::isfinite(cloud.y[i]) &&
+                  std::isfinite(cloud.z[i]));
+      ASSERT_LT(cloud.firing[i], cloud.firings.size());
+    }
+  }
+}
+
+// --- a real capture against somebody else's decoder ---------------------------------------------
+
+/// One point of the other decoder's cloud: fields x y z intensity return_type channel azimuth
+/// elevation distance time_stamp, packed.
+struct OtherPoint {
+  float x, y, z;
+  int channel;
+  float distance;
+  std::uint32_t time_in_packet_ns;
+};
+
+std::vector<OtherPoint> readOtherCloud(const std::string& path) {
+  std::ifstream stream(path, std::ios::binary);
+  const std::string file((std::istreambuf_iterator<char>(stream)),
+                         std::istreambuf_iterator<char>());
+  const std::string mark = "DATA binary\n";
+  const char* data = file.data() + file.find(mark) + mark.size();
+  std::vector<OtherPoint> points;
+  for (; data + 32 <= file.data() + file.size(); data += 32) {
+    OtherPoint point;
+    std::uint16_t channel;
+    std::memcpy(&point.x, data, 4);
+    std::memcpy(&point.y, data + 4, 4);
+    std::memcpy(&point.z, data + 8, 4);
+    std::memcpy(&channel, data + 14, 2);
+    std::memcpy(&point.distance, data + 24, 4);
+    std::memcpy(&point.time_in_packet_ns, data + 28, 4);
+    point.channel = channel;
+    points.push_back(point);
+  }
+  return points;
+}
+
+double percentile(std::vector<double> values, double share) {
+  std::sort(values.begin(), values.end());
+  return values.at(static_cast<std::size_t>(share * static_cast<double>(values.size() - 1)));
+}
+
+TEST(PacketDecoder, AgreesWithAnIndependentDecoderOnARealCapture) {
+  const std::string folder = "data/vlp16_packets/";
+  const std::string cloud_name = "nebula_vlp16_expected_1673400472138016708.pcd";
+  SLF_SKIP_WITHOUT(folder + "nebula_vlp16_scans.npz");
+  SLF_SKIP_WITHOUT(folder + cloud_name);
+  const auto arrays = readNpz(sharedPath(folder + "nebula_vlp16_scans.npz"));
+  const std::vector<double> stamps = arrays.at("packet_stamp").as<double>();
+  const std::vector<std::uint8_t> bytes = arrays.at("packets").as<std::uint8_t>();
+  const std::vector<OtherPoint> others = readOtherCloud(sharedPath(folder + cloud_name));
+  ASSERT_EQ(bytes.size(), stamps.size() * kPacketBytes);
+  ASSERT_EQ(others.size(), 14831u);
+
+  // The other's scan begins with the last packet of the third scan.
+  const std::size_t first = 452;
+  std::vector<Packet> packets;
+  for (std::size_t i = first; i < stamps.size(); ++i) {
+    Packet packet;
+    packet.stamp = toNs(stamps[i]);
+    std::copy_n(bytes.begin() + static_cast<std::ptrdiff_t>(i * kPacketBytes), kPacketBytes,
+                packet.data.begin());
+    packets.push_back(packet);
+  }
+  const DecodedScan scan = PacketDecoder({}).decode(packets, packets[0].stamp, "velodyne");
+  std::map<std::pair<StampNs, int>, std::vector<std::size_t>> ours;
+  for (std::size_t i = 0; i < scan.cloud.size(); ++i) {
+    ours[{scan.cloud.time_ns[i], scan.cloud.ring[i]}].push_back(i);
+  }
+
+  // The other's times are relative to the packet and count each block of a pair as a time of its
+  // own: block * 2 + firing firings. Its packets are found by their order and the exact range.
+  const auto match = [&](const OtherPoint& other, std::size_t packet, int& block) -> long {
+    const int laser = other.channel < 8 ? 2 * other.channel : 2 * (other.channel - 8) + 1;
+    const int firing =
+        static_cast<int>(std::lround((other.time_in_packet_ns - 2304.0 * laser) / 55296.0));
+    block = firing / 2;
+    const StampNs time =
+        packets[packet].stamp + (block / 2 * 2 + firing % 2) * 55296 + laser * 2304;
+    const auto found = ours.find({time, other.channel});
+    if (found == ours.end()) return -1;
+    for (const std::size_t i : found->second) {
+      const Point p = at(scan.cloud, i);
+      if (std::abs(distance(p, Point()) - other.distance) < 5e-4) return static_cast<long>(i);
+    }
+    return -1;
+  };
+  std::vector<double> all, first_returns;
+  std::size_t packet = 0;
+  std::uint32_t last_time = 0;
+  std::size_t unmatched = 0;
+  for (const OtherPoint& other : others) {
+    if (other.time_in_packet_ns + 100000 < last_time) ++packet;
+    last_time = other.time_in_packet_ns;
+    int block = 0;
+    long mine = match(other, packet, block);
+    if (mine < 0 && packet + 1 < packets.size()) {
+      mine = match(other, packet + 1, block);
+      if (mine >= 0) ++packet;
+    }
+    if (mine < 0) {
+      ++unmatched;
+      continue;
+    }
+    if (block >= 10) continue;  // the other does not interpolate the azimuth of the last pair
+    const Point p = at(scan.cloud, static_cast<std::size_t>(mine));
+    Point q;
+    q.x = other.x;
+    q.y = other.y;
+    q.z = other.z;
+    all.push_back(distance(p, q));
+    if (block % 2 == 0) first_returns.push_back(distance(p, q));
+  }
+  std::cout << others.size() << " points, " << unmatched << " unmatched; distance (mm) of "
+            << all.size() << ": median " << 1e3 * percentile(all, 0.5) << ", 99 % "
+            << 1e3 * percentile(all, 0.99) << ", max " << 1e3 * percentile(all, 1.0)
+            << "; first returns: median " << 1e3 * percentile(first_returns, 0.5) << ", 99 % "
+            << 1e3 * percentile(first_returns, 0.99) << ", max "
+            << 1e3 * percentile(first_returns, 1.0) << "\n";
+  EXPECT_EQ(unmatched, 0u);
+  EXPECT_GT(all.size(), 12000u);
+  EXPECT_LT(percentile(all, 0.5), 0.1e-3);
+  EXPECT_LT(percentile(all, 0.99), 16e-3);
+  EXPECT_LT(percentile(all, 1.0), 48e-3);
+  // The other rounds azimuths to 0.01 deg: half a step at the largest range, 14.7 m.
+  EXPECT_LT(percentile(first_returns, 1.0), 14.7 * 0.005 * kPi / 180.0 + 1e-4);
+}
+
+}  // namespace
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,148 @@
+// SPDX-License-Identifier: MIT
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <limits>
+#include <random>
+#include <string>
+
+#include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/motion/pose_buffer.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+constexpr double kPi = 3.14159265358979323846;
+
+Transform pose(double x, double yaw_rad) {
+  Transform T = Transform::Identity();
+  T.linear() = Eigen::AngleAxisd(yaw_rad, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  T.translation() = Eigen::Vector3d(x, 2.0 * x, -x);
+  return T;
+}
+
+double yaw(const Transform& T) { return std::atan2(T.linear()(1, 0), T.linear()(0, 0)); }
+
+TEST(Interpolate, IsLinearInTranslationAndAngle) {
+  const Transform a = pose(1.0, 0.1);
+  const Transform b = pose(3.0, 0.9);
+  for (const double fraction : {0.0, 0.25, 0.5, 1.0}) {
+    const Transform T = interpolate(a, b, fraction);
+    EXPECT_NEAR(T.translation().x(), 1.0 + 2.0 * fraction, 1e-12);
+    EXPECT_NEAR(T.translation().z(), -1.0 - 2.0 * fraction, 1e-12);
+    EXPECT_NEAR(yaw(T), 0.1 + 0.8 * fraction, 1e-12);
+  }
+}
+
+TEST(Interpolate, TakesTheShorterWayAcrossTheHalfTurn) {
+  // The quaternions of +179 and -179 deg have a negative dot product.
+  const double degree = kPi / 180.0;
+  const Transform T = interpolate(pose(0.0, 179.0 * degree), pose(0.0, -179.0 * degree), 0.25);
+  EXPECT_NEAR(yaw(T), 179.5 * degree, 1e-12);
+}
+
+TEST(Interpolate, KeepsRotationsOrthonormal) {
+  std::mt19937 random(7);
+  std::normal_distribution<double> normal;
+  for (int i = 0; i < 1000; ++i) {
+    const auto draw = [&] {
+      Transform T = Transform::Identity();
+      T.linear() =
+          Eigen::Quaterniond(normal(random), normal(random), normal(random), normal(random))
+              .normalized()
+              .toRotationMatrix();
+      return T;
+    };
+    const Eigen::Matrix3d R = interpolate(draw(), draw(), 0.3).linear();
+    EXPECT_LT((R.transpose() * R - Eigen::Matrix3d::Identity()).norm(), 1e-12);
+    EXPECT_NEAR(R.determinant(), 1.0, 1e-12);
+  }
+}
+
+TEST(PoseBuffer, AnswersBetweenItsReadingsOnly) {
+  PoseBuffer buffer;
+  EXPECT_TRUE(buffer.empty());
+  EXPECT_FALSE(buffer.covers(0));
+  EXPECT_FALSE(buffer.lookup(0));
+  EXPECT_FALSE(buffer.closest(0));
+
+  buffer.add({100, pose(1.0, 0.0)});
+  EXPECT_TRUE(buffer.covers(100));
+  EXPECT_FALSE(buffer.covers(101));
+  EXPECT_EQ(buffer.lookup(100)->translation().x(), 1.0);
+  EXPECT_EQ(buffer.closest(100)->translation().x(), 1.0);
+
+  buffer.add({200, pose(2.0, 0.0)});
+  EXPECT_FALSE(buffer.lookup(99));
+  EXPECT_FALSE(buffer.lookup(201));
+  EXPECT_FALSE(buffer.closest(201));
+  EXPECT_NEAR(buffer.lookup(130)->translation().x(), 1.3, 1e-12);
+  EXPECT_EQ(buffer.closest(149)->translation().x(), 1.0);
+  EXPECT_EQ(buffer.closest(150)->translation().x(), 1.0) << "half-way: the earlier reading";
+  EXPECT_EQ(buffer.closest(151)->translation().x(), 2.0);
+  EXPECT_EQ(buffer.lookup(200)->translation().x(), 2.0);
+}
+
+TEST(PoseBuffer, SortsLateReadingsAndReplacesDuplicates) {
+  PoseBuffer buffer;
+  for (const StampNs stamp : {300, 100, 400, 200}) {
+    buffer.add({stamp, pose(static_cast<double>(stamp), 0.0)});
+  }
+  ASSERT_EQ(buffer.size(), 4u);
+  for (std::size_t i = 0; i < 4; ++i) {
+    EXPECT_EQ(buffer.readings()[i].stamp, static_cast<StampNs>(100 * (i + 1)));
+  }
+  buffer.add({200, pose(-7.0, 0.0)});
+  ASSERT_EQ(buffer.size(), 4u);
+  EXPECT_EQ(buffer.lookup(200)->translation().x(), -7.0);
+}
+
+TEST(PoseBuffer, InterpolatesAcrossAGap) {
+  PoseBuffer buffer;
+  buffer.add({0, pose(0.0, 0.0)});
+  buffer.add({10, pose(1.0, 0.0)});
+  buffer.add({10010, pose(2.0, 0.0)});
+  EXPECT_NEAR(buffer.lookup(5010)->translation().x(), 1.5, 1e-12);
+}
+
+TEST(PoseBuffer, ForgetsWhatIsOlderThanItsHistory) {
+  PoseBuffer buffer(100);
+  for (StampNs stamp = 0; stamp <= 1000; stamp += 10) buffer.add({stamp, pose(0.0, 0.0)});
+  EXPECT_EQ(buffer.readings().front().stamp, 900);
+  EXPECT_EQ(buffer.size(), 11u);
+  buffer.add({500, pose(0.0, 0.0)});
+  EXPECT_EQ(buffer.readings().front().stamp, 900) << "a reading beyond the history is not kept";
+  buffer.clear();
+  EXPECT_TRUE(buffer.empty());
+}
+
+TEST(PoseBuffer, RefusesBrokenPosesAndStaysAsItWas) {
+  PoseBuffer buffer;
+  buffer.add({1, pose(0.0, 0.0)});
+  const auto message = [&](const Transform& T) -> std::string {
+    try {
+      buffer.add({77, T});
+    } catch (const DataError& error) {
+      return error.what();
+    }
+    return "";
+  };
+  Transform bad = pose(0.0, 0.0);
+  bad.translation().y() = std::numeric_limits<double>::quiet_NaN();
+  EXPECT_NE(message(bad).find("77 ns"), std::string::npos);
+  bad.translation().y() = std::numeric_limits<double>::infinity();
+  EXPECT_NE(message(bad).find("finite"), std::string::npos);
+  bad = pose(0.0, 0.0);
+  bad.linear() *= 1.01;
+  EXPECT_NE(message(bad).find("orthonormal"), std::string::npos);
+  bad = pose(0.0, 0.0);
+  bad.linear().col(0) *= -1.0;
+  EXPECT_NE(message(bad).find("orthonormal"), std::string::npos) << "a mirror is no rotation";
+  bad = pose(0.0, 0.0);
+  bad.linear().setZero();
+  EXPECT_NE(message(bad).find("orthonormal"), std::string::npos);
+  EXPECT_EQ(buffer.size(), 1u);
+}
+
+}  // namespace
+}  // namespace semantic_lidar_fusion

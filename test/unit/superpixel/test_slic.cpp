@@ -1,0 +1,186 @@
+// SPDX-License-Identifier: MIT
+#include <gtest/gtest.h>
+
+#include <limits>
+#include <opencv2/imgcodecs.hpp>
+#include <opencv2/imgproc.hpp>
+#include <string>
+
+#include "map_properties.h"
+#include "optional_data.h"
+#include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/superpixel/slic.h"
+#include "superpixel_quality.h"
+#ifdef SLF_TEST_XIMGPROC
+#include <opencv2/ximgproc/slic.hpp>
+#endif
+
+namespace semantic_lidar_fusion {
+namespace {
+
+SlicConfig withCount(int count) {
+  SlicConfig config;
+  config.count = count;
+  return config;
+}
+
+TEST(Slic, ClampsTheCountToOneSuperpixelPerSixtyFourPixels) {
+  EXPECT_EQ(clampedSuperpixelCount(withCount(1000), {960, 604}), 1000);
+  EXPECT_EQ(clampedSuperpixelCount(withCount(1000), {80, 80}), 100);
+  EXPECT_EQ(clampedSuperpixelCount(withCount(1000), {80, 79}), 98);
+  EXPECT_EQ(clampedSuperpixelCount(withCount(1000), {7, 9}), 1);
+  EXPECT_EQ(clampedSuperpixelCount(withCount(1), {1, 1}), 1);
+  EXPECT_EQ(clampedSuperpixelCount(withCount(std::numeric_limits<int>::max()), {65536, 65536}),
+            1 << 26);
+}
+
+TEST(Slic, GivesAValidMapForEverySizeAndContent) {
+  const std::vector<ImageSize> sizes = {{1, 1},    {1, 2},    {2, 1},   {1, 97},    {640, 1},
+                                        {1, 640},  {3, 1000}, {7, 7},   {8, 8},     {31, 33},
+                                        {32, 32},  {33, 31},  {64, 16}, {101, 103}, {129, 65},
+                                        {257, 63}, {15, 200}, {95, 1},  {2, 311}};
+  for (const ImageSize& size : sizes) {
+    for (const int type : {CV_8UC1, CV_8UC3}) {
+      const std::vector<cv::Mat> images = {
+          cv::Mat(size.height, size.width, type, cv::Scalar::all(0)),
+          cv::Mat(size.height, size.width, type, cv::Scalar::all(255)),
+          patchImage(size.width, size.height, type, 1),
+          noiseImage(size.width, size.height, type, 2),
+          // Black or white at random: most seeds lose all their pixels to others.
+          noiseImage(size.width, size.height, type, 3) > 127};
+      for (std::size_t i = 0; i < images.size(); ++i) {
+        for (const int count : {1, 2, 7, 40, 100000}) {
+          SCOPED_TRACE("size " + std::to_string(size.width) + "x" + std::to_string(size.height) +
+                       ", type " + std::to_string(type) + ", image " + std::to_string(i) +
+                       ", count " + std::to_string(count));
+          const SuperpixelMap map = Slic(withCount(count)).cluster(images[i], size);
+          expectValidMap(map, size.width, size.height);
+          expectCountWithinTenPercent(map.count, clampedSuperpixelCount(withCount(count), size));
+        }
+      }
+    }
+  }
+}
+
+TEST(Slic, IsDeterministicAndIgnoresThePaddingOfTheImage) {
+  const cv::Mat image = patchImage(203, 151, CV_8UC3, 4);
+  const ImageSize size{203, 151};
+  const SuperpixelMap first = Slic(withCount(90)).cluster(image, size);
+  cv::Mat padded = noiseImage(300, 200, CV_8UC3, 5);
+  cv::Mat part = padded(cv::Rect(41, 17, 203, 151));
+  image.copyTo(part);
+  const SuperpixelMap second = Slic(withCount(90)).cluster(part, size);
+  EXPECT_EQ(first.count, second.count);
+  EXPECT_EQ(cv::norm(first.ids, second.ids, cv::NORM_L1), 0.0);
+}
+
+TEST(Slic, FollowsAnEdgeOfColourOfEqualLightness) {
+  // Both colours have CIELab L* = 60 within 0.5; only their hue differs.
+  cv::Mat image(96, 96, CV_8UC3, cv::Scalar(60, 108, 235));
+  const int edge = 41;
+  image.colRange(0, edge).setTo(cv::Scalar(190, 145, 90));
+  const SuperpixelMap map = Slic(withCount(36)).cluster(image, {96, 96});
+  std::set<int> left, right;
+  for (int y = 0; y < 96; ++y) {
+    for (int x = 0; x < 96; ++x) (x < edge ? left : right).insert(map.ids.at<int>(y, x));
+  }
+  for (const int id : left) EXPECT_EQ(right.count(id), 0U) << "superpixel " << id << " crosses";
+}
+
+TEST(Slic, CellsOfAPlainImageAreEqualSquares) {
+  const SuperpixelMap map =
+      Slic(withCount(16)).cluster(cv::Mat(64, 64, CV_8UC3, cv::Scalar(9, 99, 199)), {64, 64});
+  EXPECT_EQ(map.count, 16);
+  for (const int size : map.sizes)
+    EXPECT_NEAR(size, 256, 2 * 16 + 1);  // one row or column each way
+}
+
+TEST(Slic, ReducesTheImageByBoxAveraging) {
+  // Each 2x2 box of the fine image has a mean that the coarse image holds exactly.
+  const cv::Mat coarse = patchImage(90, 66, CV_8UC3, 6) & cv::Scalar::all(0xfc);
+  cv::Mat fine(132, 180, CV_8UC3);
+  for (int y = 0; y < fine.rows; ++y) {
+    for (int i = 0; i < 3 * fine.cols; ++i) {
+      const int mean = coarse.ptr(y / 2)[(i / 6) * 3 + i % 3];
+      const int spread = std::min(mean, 255 - mean);
+      const bool bright = (y + i / 3) % 2 == 0;
+      fine.ptr(y)[i] = static_cast<uchar>(bright ? mean + spread : mean - spread);
+    }
+  }
+  const SuperpixelMap expected = Slic(withCount(60)).cluster(coarse, {90, 66});
+  const SuperpixelMap map = Slic(withCount(60)).cluster(fine, {90, 66});
+  EXPECT_EQ(cv::norm(expected.ids, map.ids, cv::NORM_L1), 0.0);
+}
+
+TEST(Slic, AcceptsAnyRatioBetweenImageAndMap) {
+  const cv::Mat image = patchImage(131, 97, CV_8UC3, 7);
+  for (const ImageSize& size :
+       {ImageSize{130, 96}, {64, 48}, {53, 17}, {1, 1}, {260, 50}, {200, 200}, {131, 1}}) {
+    SCOPED_TRACE(std::to_string(size.width) + "x" + std::to_string(size.height));
+    const SuperpixelMap map = Slic(withCount(30)).cluster(image, size);
+    expectValidMap(map, size.width, size.height);
+    expectCountWithinTenPercent(map.count, clampedSuperpixelCount(withCount(30), size));
+  }
+}
+
+TEST(Slic, RefusesWhatItCannotCluster) {
+  Slic slic(SlicConfig{});
+  EXPECT_THROW(slic.cluster(cv::Mat(), {1, 1}), DataError);
+  EXPECT_THROW(slic.cluster(cv::Mat(4, 4, CV_16UC1, cv::Scalar(0)), {4, 4}), DataError);
+  EXPECT_THROW(slic.cluster(cv::Mat(4, 4, CV_8UC4, cv::Scalar(0)), {4, 4}), DataError);
+  EXPECT_THROW(slic.cluster(cv::Mat(4, 4, CV_8UC3, cv::Scalar(0)), {0, 4}), DataError);
+  EXPECT_THROW(slic.cluster(cv::Mat(4, 4, CV_8UC3, cv::Scalar(0)), {4, -1}), DataError);
+  SlicConfig bad;
+  bad.count = 0;
+  bad.compactness = std::numeric_limits<double>::quiet_NaN();
+  bad.iterations = 101;
+  try {
+    Slic{bad};
+    FAIL() << "accepted";
+  } catch (const ConfigError& error) {
+    EXPECT_EQ(error.problems().size(), 3U) << error.what();
+  }
+}
+
+// On real photographs with human labels, the plain measure of how much superpixels straddle
+// segments is no worse than that of OpenCV's SLIC at the same number of superpixels.
+TEST(Slic, UndersegmentsCamvidNoMoreThanOpenCv) {
+  SLF_SKIP_WITHOUT("data/camvid/Seq05VD_f00540.png");
+#ifndef SLF_TEST_XIMGPROC
+  GTEST_SKIP() << "built without opencv_ximgproc";
+#else
+  double ours = 0.0, theirs = 0.0;
+  int images = 0, our_count = 0, their_count = 0;
+  const std::vector<std::string> names = camvidNames();
+  for (std::size_t i = 0; i < names.size(); i += 4) {
+    const std::string& name = names[i];
+    const cv::Mat image = cv::imread(sharedPath("data/camvid/" + name + ".png"));
+    const cv::Mat truth =
+        cv::imread(sharedPath("data/camvid/" + name + "_annot.png"), cv::IMREAD_UNCHANGED);
+    ASSERT_FALSE(image.empty() || truth.empty()) << name;
+    cv::Mat lab, their_ids;
+    cv::cvtColor(image, lab, cv::COLOR_BGR2Lab);
+    const auto peer = cv::ximgproc::createSuperpixelSLIC(lab, cv::ximgproc::SLIC, 16, 10.0F);
+    peer->iterate(10);
+    peer->enforceLabelConnectivity(25);
+    peer->getLabels(their_ids);
+    const int count = peer->getNumberOfSuperpixels();
+    const SuperpixelMap map = clusterToCount(image, count);
+    ASSERT_LE(map.count, count) << name;
+    ASSERT_GE(map.count, count - 3) << name;
+    our_count += map.count;
+    their_count += count;
+    ours += undersegmentationError(map.ids, truth);
+    theirs += undersegmentationError(their_ids, truth);
+    ++images;
+  }
+  ours /= images;
+  theirs /= images;
+  std::cout << "undersegmentation error, mean of " << images << " images: ours " << ours << " at "
+            << our_count << " superpixels, OpenCV's " << theirs << " at " << their_count << "\n";
+  EXPECT_LE(ours, theirs);
+#endif
+}
+
+}  // namespace
+}  // namespace semantic_lidar_fusion
