@@ -159,8 +159,8 @@ class Router {
  public:
   void addTransforms(const rosbag::MessageInstance& m, bool is_static) {
     index_->transforms.push_back(m);
-    const auto transforms = instantiate<tf2_msgs::TFMessage>(m);
-    for (const auto& transform : transforms->transforms) {
+    const auto message = instantiate<tf2_msgs::TFMessage>(m);
+    for (const auto& transform : message->transforms) {
       const std::uint64_t repeated = poses_->counters().repeated;
       if (!poses_->add(transform, is_static) && poses_->counters().repeated == repeated) {
         drops_->count("tf: unusable transforms",

@@ -1,13 +1,14 @@
 #!/bin/bash
 # SPDX-License-Identifier: MIT
 # Installs the Debian or Ubuntu packages that building, testing and the demonstration need.
-# Asks for sudo only when not root and only when something is missing. Run it or source nothing:
+# Uses sudo when not root, and only when something is missing; does nothing twice.
+#
 #   scripts/install_dependencies.sh [--help]
 set -euo pipefail
 PATH=/usr/sbin:/usr/bin:/sbin:/bin
 
 if [ "${1:-}" = --help ]; then
-  sed -n '3,5s/^# //p' "$0"
+  sed -n '3,6s/^# \{0,1\}//p' "$0"
   exit 0
 fi
 
@@ -50,55 +51,68 @@ else
   required="$common $debian_ros"
 fi
 
-missing=()
-for package in $required $optional; do
-  installed "$package" || missing+=("$package")
-done
-if [ ${#missing[@]} -eq 0 ]; then
+missing_of() {
+  local package
+  for package in "$@"; do
+    installed "$package" || echo "$package"
+  done
+}
+missing=$(missing_of $required)
+extra=$(missing_of $optional)
+if [ -z "$missing$extra" ]; then
   say "nothing is missing"
   exit 0
 fi
 
 as_root() { "$@"; }
 if [ "$(id -u)" -ne 0 ]; then
-  if ! command -v sudo >/dev/null; then
-    say "not root and no sudo; missing: ${missing[*]}" >&2
+  if command -v sudo >/dev/null; then
+    as_root() { sudo "$@"; }
+  elif [ -n "$missing" ]; then
+    say "not root and no sudo; missing:" $missing >&2
     exit 1
+  else
+    say "not root and no sudo; going on without" $extra
+    exit 0
   fi
-  as_root() { sudo "$@"; }
 fi
 apt() {
-  as_root env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 \
-    -o Acquire::Retries=3 "$@" </dev/null
+  as_root env DEBIAN_FRONTEND=noninteractive apt-get -q -o DPkg::Lock::Timeout=300 \
+    -o Acquire::Retries=3 "$@" </dev/null >/dev/null
 }
 
-# Packages that this release does not have are wanted only if optional, and asked for but once.
-select_offered() {
-  wanted=()
-  absent=()
-  for package in "${missing[@]}"; do
-    if offered "$package"; then
-      wanted+=("$package")
-    elif [[ " $(echo $optional) " != *" $package "* ]]; then
-      absent+=("$package")
-    fi
+# A release without an optional package is not asked for it again while its lists are there.
+offered_of() {
+  local package
+  for package in "$@"; do
+    ! offered "$package" || echo "$package"
   done
 }
-select_offered
-if [ ${#wanted[@]} -eq 0 ] && [ ${#absent[@]} -eq 0 ] && [ -n "$(ls /var/lib/apt/lists/*Packages* 2>/dev/null)" ]; then
+lists() { ls /var/lib/apt/lists/*Packages* 2>/dev/null; }
+if [ -z "$missing" ] && [ -n "$(lists)" ] && [ -z "$(offered_of $extra)" ]; then
   say "nothing is missing that this release has"
   exit 0
 fi
+
 say "updating the package lists"
-apt update -q >/dev/null
-select_offered
-if [ ${#absent[@]} -gt 0 ]; then
-  say "this release does not offer: ${absent[*]}" >&2
-  say "on Ubuntu 20.04 set up the ROS Noetic repository and install ros-noetic-ros-base first" >&2
-  exit 1
+if ! apt update; then
+  [ -z "$missing" ] || exit 1
+  say "going on without" $extra
+  exit 0
 fi
-if [ ${#wanted[@]} -gt 0 ]; then
-  say "installing ${#wanted[@]} packages: ${wanted[*]}"
-  apt install -q -y --no-install-recommends "${wanted[@]}" >/dev/null
+if [ -n "$missing" ]; then
+  for package in $missing; do
+    offered "$package" && continue
+    say "this release does not offer $package; on Ubuntu 20.04 set up the ROS Noetic repository" \
+      "and install ros-noetic-ros-base first" >&2
+    exit 1
+  done
+  say "installing" $missing
+  apt install -y --no-install-recommends $missing
+fi
+extra=$(offered_of $extra)
+if [ -n "$extra" ]; then
+  say "installing" $extra
+  apt install -y --no-install-recommends $extra || say "going on without" $extra
 fi
 say "done"

@@ -14,14 +14,17 @@ from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Se
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.errors import DataError
 
+_RULE = "=" * 80 + "\n"
 _HEADER = """Header header
 """
-_HEADER_DEFINITION = """================================================================================
-MSG: std_msgs/Header
+_HEADER_DEFINITION = (
+    _RULE
+    + """MSG: std_msgs/Header
 uint32 seq
 time stamp
 string frame_id
 """
+)
 _PACKET_DEFINITION = """time stamp
 uint8[1206] data
 """
@@ -29,7 +32,7 @@ _DEFINITIONS = {
     "velodyne_msgs/VelodynePacket": _PACKET_DEFINITION,
     "velodyne_msgs/VelodyneScan": _HEADER
     + "VelodynePacket[] packets\n"
-    + "================================================================================\n"
+    + _RULE
     + "MSG: velodyne_msgs/VelodynePacket\n"
     + _PACKET_DEFINITION
     + _HEADER_DEFINITION,
@@ -57,7 +60,7 @@ def to_stamp(stamp_ns: int) -> Any:
 
 
 def message_class(type_name: str) -> Any:
-    """The class of a message type, e.g. "sensor_msgs/Image"; velodyne_msgs also without its package.
+    """The class of a message type ("sensor_msgs/Image"), of velodyne_msgs without its package.
 
     Raises DataError if the type is not known here.
     """

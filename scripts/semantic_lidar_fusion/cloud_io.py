@@ -43,8 +43,8 @@ def point_dtype(fields: Sequence[Tuple[str, str]]) -> np.dtype:
 def to_array(message: Any) -> np.ndarray:
     """The points of a PointCloud2 as a structured array (height * width,), row by row.
 
-    A read-only view of the message's bytes (a copy only if its rows are padded). Fields with a count
-    above 1 become sub-arrays. Raises DataError that names the field or size that is wrong.
+    A read-only view of the message's bytes (a copy only if its rows are padded). Fields with a
+    count above 1 become sub-arrays. Raises DataError that names the field or size that is wrong.
     """
     step, width, height = int(message.point_step), int(message.width), int(message.height)
     row_step = int(message.row_step)

@@ -12,13 +12,14 @@ Compact form: numbered .jpg and .npz (xyz_2mm int16, intensity) beside calib_and
 
 Time of a point. The HDL-64E turns clockwise seen from above (azimuth atan2(y, x) falls with time),
 from straight behind to straight behind, and triggers the cameras looking ahead; timestamps_start,
-timestamps and timestamps_end are those three moments. (The data set's readme says counter-clockwise;
-a car that closes in from behind shows the seam: its left half is measured first.) Single lasers are
-turned by a few degrees against that, up to 2 ms, which the files do not tell.
+timestamps and timestamps_end are those three moments. (The data set's readme says
+counter-clockwise; a car that closes in from behind shows the seam, and its left part is measured
+first.) The files do not tell by how much single lasers are turned against that, a few degrees or up
+to 2 ms; so within a few degrees of straight behind a point may get the wrong end of the sweep.
 
 Frames. `base_link` is the IMU, `velodyne` and `camera_0N_optical_frame` hang below. `odom` has its
-origin at the first oxts reading, x east, y north, z up. The baseline of a rectified camera stands in
-tf, so P of camera_info has no fourth column.
+origin at the first oxts reading, x east, y north, z up. The baseline of a rectified camera stands
+in tf, so P of camera_info has no fourth column.
 """
 
 import calendar
@@ -46,8 +47,8 @@ _COMPACT_UNIT_M = 0.002
 def read(
     folder: str, labels: LabelSet, cameras: Optional[List[str]], first: int, last: Optional[int]
 ) -> records.Drive:
-    """A drive in either form. `cameras`: image folders, default image_02 and image_03 as they exist;
-    `first`, `last`: numbers of the first and last frame to take."""
+    """A drive in either form. `cameras`: image folders, default image_02 and image_03 as they
+    exist; `first`, `last`: numbers of the first and last frame to take."""
     records.require_folder(folder)
     if os.path.isfile(os.path.join(folder, _COMPACT_FILE)):
         return _read_compact(folder, labels, first, last)
@@ -78,7 +79,7 @@ def _read_times(path: str) -> List[int]:
 def _stamped_files(
     folder: str, endings: List[str], stamps: str = "timestamps.txt"
 ) -> Tuple[Dict[int, str], List[int]]:
-    """Files of folder/data by number, and the times of folder/timestamps.txt (line 1 = number 0)."""
+    """Files of folder/data by number, and the times of timestamps.txt (line 1 = number 0)."""
     files = records.numbered_files(os.path.join(folder, "data"), endings)
     times = _read_times(os.path.join(folder, stamps))
     if len(files) != len(times) or max(files) >= len(times):
@@ -99,7 +100,8 @@ def _stamped_files(
 def mercator_poses(readings: np.ndarray) -> np.ndarray:
     """T_odom_imu (M, 4, 4) of oxts rows (M, >= 6): lat, lon (deg), alt (m), roll, pitch, yaw (rad).
 
-    Mercator projection scaled at the first latitude, relative to the first position; x east, y north.
+    Mercator projection scaled at the first latitude, relative to the first position;
+    x east, y north.
     """
     latitude, longitude = readings[:, 0], readings[:, 1]
     scale = np.cos(np.radians(latitude[0]))
@@ -271,7 +273,7 @@ def _read_raw(
 def _beside(
     images: List[records.ImageRecord], scans: List[records.ScanRecord], whole: bool
 ) -> List[records.ImageRecord]:
-    """The images around the chosen scans; numbers of cameras and scans differ in extracted drives."""
+    """The images around the chosen scans; in extracted drives the numbers differ."""
     begin, end = scans[0].stamp_ns, scans[-1].stamp_ns + 200000000
     chosen = [i for i in images if whole or begin <= i.stamp_ns <= end]
     if not chosen:

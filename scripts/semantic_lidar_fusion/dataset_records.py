@@ -179,11 +179,7 @@ def read_poses(path: str) -> np.ndarray:
 def read_points(path: str) -> Tuple[np.ndarray, np.ndarray]:
     """xyz (N, 3) and intensity (N,) f32 of a KITTI scan: .bin (x y z r float32) or .txt."""
     if path.endswith(".txt"):
-        rows = [
-            parse_numbers(line, 4, "%s line %d" % (path, number))
-            for number, line in enumerate(read_lines(path), 1)
-        ]
-        values = np.array(rows, dtype=np.float32).reshape(-1, 4)
+        values = _text_points(path)
     else:
         data = read_bytes(path)
         if len(data) % 16:
@@ -192,6 +188,19 @@ def read_points(path: str) -> Tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(values).all():
         raise DataError("%s: a point is not finite" % path)
     return np.ascontiguousarray(values[:, :3]), np.ascontiguousarray(values[:, 3])
+
+
+def _text_points(path: str) -> np.ndarray:
+    lines = read_lines(path)
+    try:
+        values = np.array(" ".join(lines).split(), dtype=np.float32)
+    except ValueError:
+        values = np.zeros(0, dtype=np.float32)
+    if len(values) != 4 * len(lines):
+        for number, line in enumerate(lines, 1):
+            parse_numbers(line, 4, "%s line %d" % (path, number))
+        raise DataError("%s: not lines of x y z r" % path)
+    return values.reshape(-1, 4)
 
 
 def read_label_ids(path: str, count: int) -> np.ndarray:
@@ -211,7 +220,7 @@ def map_ids(ids: np.ndarray, table: Dict[int, int]) -> np.ndarray:
 
 
 def class_table(names: Dict[int, Sequence[str]], labels: LabelSet) -> Dict[int, int]:
-    """Data-set id -> id in `labels`: for each id the first of its candidate names that the set has."""
+    """Data-set id -> id in `labels`: the first of its candidate names that the set has."""
     table = {}
     for source, candidates in names.items():
         ids = [labels.id_of(name) for name in candidates]
@@ -232,6 +241,8 @@ def image_size(data: bytes, path: str) -> Tuple[int, int, str]:
             raise DataError("%s: the PNG is cut off" % path)
         return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), "png"
     if data[:2] == b"\xff\xd8":
+        if b"\xff\xd9" not in data[-1024:]:
+            raise DataError("%s: the JPEG is cut off" % path)
         at = 2
         while at + 9 < len(data) and data[at] == 0xFF:
             marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
@@ -279,8 +290,8 @@ def rectified_camera(
 ) -> Tuple[np.ndarray, np.ndarray]:
     """K (3, 3) and T_parent_camera (4, 4) of a rectified KITTI camera with P (3, 4) = K [I | b].
 
-    `t_parent_rect` places the rectified reference camera. b, the camera's place in it, goes into the
-    transform (all three numbers of it), so that P of camera_info has no fourth column.
+    `t_parent_rect` places the rectified reference camera. b, the camera's place in it, goes into
+    the transform (all three numbers of it), so that P of camera_info has no fourth column.
     """
     k = projection[:, :3].copy()
     offset = np.linalg.solve(k, projection[:, 3])

@@ -10,8 +10,8 @@ Public layout, as the downloads unpack into one folder Rellis-3D/0000N:
   camera_info.txt (fx fy cx cy), transforms.yaml (the camera in the lidar's frame), poses.txt
 The .ply scans are preferred: they alone have times and rings. Without them a scan takes the time of
 the image with its number, all points are of that instant, and motion is disabled.
-Compact form: frame.npz, image.jpg, image_label_ids.png. It has no stamps: the image is placed at the
-middle of the scan, and motion is disabled for want of poses.
+Compact form: frame.npz, image.jpg, image_label_ids.png. It has no stamps: the image is placed at
+the middle of the scan, and motion is disabled for want of poses.
 
 The camera is a pinhole, as camera_info.txt says. The data set's own projection example adds the
 distortion -0.134313, -0.025905, 0.002181, 0.00084; on the frame that is at hand, points and human

@@ -3,9 +3,9 @@
 
 Layout: sequences/NN/{velodyne/NNNNNN.bin, labels/NNNNNN.label, image_2/NNNNNN.png, calib.txt,
 times.txt, poses.txt}; image_2 and image_3 come from the KITTI odometry download. The scans are
-corrected for motion already, to the time of their line in times.txt, which is the images' too: every
-point is of that instant, and the rig file disables motion. `base_link` is the lidar (`velodyne`),
-`odom` its pose at the first line of poses.txt, x forward, z up.
+corrected for motion already, to the time of their line in times.txt, which is the images' too:
+every point is of that instant, and the rig file disables motion. `base_link` is the lidar
+(`velodyne`), `odom` its pose at the first line of poses.txt, x forward, z up.
 """
 
 import os

@@ -2,8 +2,8 @@
 """A `Drive` as a bag and a rig file.
 
 Topics: <camera>/image/compressed (the file's bytes) or <camera>/image, <camera>/camera_info,
-<camera>/scores if asked for; the lidar's PointCloud2 (x y z intensity f32, ring u16, t u32 = ns after
-the stamp); points_truth where the points have labels; tf odom -> base_link, and all else static.
+<camera>/scores if asked for; the lidar's PointCloud2 (x y z intensity f32, ring u16, t u32 = ns
+after the stamp); points_truth where the points have labels; tf odom -> base_link, and all else static.
 """
 
 import heapq
@@ -334,8 +334,8 @@ def camera_info(camera: records.CameraRecord, width: int, height: int, stamp_ns:
 
 
 def one_hot_scores(labels: np.ndarray, count: int, stride: int, gain: float) -> np.ndarray:
-    """Scores (h, w, count) f32 of a label image (H, W) u8, h = ceil(H / stride): `gain` at the class
-    of the pixel under each cell's centre, 0 elsewhere (everywhere where it has none)."""
+    """Scores (h, w, count) f32 of a label image (H, W) u8, h = ceil(H / stride): `gain` at the
+    class of the pixel under each cell's centre, 0 elsewhere (everywhere where it has none)."""
     rows, columns = (-(-extent // stride) for extent in labels.shape)
     v = (2 * np.arange(rows) + 1) * labels.shape[0] // (2 * rows)
     u = (2 * np.arange(columns) + 1) * labels.shape[1] // (2 * columns)

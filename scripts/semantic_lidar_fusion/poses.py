@@ -39,7 +39,8 @@ def to_quaternion(rotation: np.ndarray) -> np.ndarray:
     """(4,) unit quaternion, w >= 0, of the rotation (3, 3); the nearest one to a matrix that is
     rounded (as calibration files are)."""
     m = np.asarray(rotation, dtype=float)
-    # The quaternion is the eigenvector of the largest eigenvalue of this symmetric matrix (Bar-Itzhack 2000).
+    # It is the eigenvector of the largest eigenvalue of this symmetric matrix (Bar-Itzhack 2000);
+    # eigh reads the lower half.
     k = np.array(
         [
             [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: MIT
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 
+#include <yaml-cpp/eventhandler.h>
+
 #include <algorithm>
 #include <cctype>
 #include <cmath>
@@ -46,6 +48,33 @@ bool nestsTooDeeply(const std::string& text) {
     }
   }
   return false;
+}
+
+class IgnoreEvents : public YAML::EventHandler {
+ public:
+  void OnDocumentStart(const YAML::Mark&) override {}
+  void OnDocumentEnd() override {}
+  void OnNull(const YAML::Mark&, YAML::anchor_t) override {}
+  void OnAlias(const YAML::Mark&, YAML::anchor_t) override {}
+  void OnScalar(const YAML::Mark&, const std::string&, YAML::anchor_t,
+                const std::string&) override {}
+  void OnSequenceStart(const YAML::Mark&, const std::string&, YAML::anchor_t,
+                       YAML::EmitterStyle::value) override {}
+  void OnSequenceEnd() override {}
+  void OnMapStart(const YAML::Mark&, const std::string&, YAML::anchor_t,
+                  YAML::EmitterStyle::value) override {}
+  void OnMapEnd() override {}
+};
+
+/// Documents of a text, at most 2. YAML::LoadAll never ends on some texts, such as ",": they hold
+/// empty documents without end.
+int countDocuments(const std::string& text) {
+  std::istringstream stream(text);
+  YAML::Parser parser(stream);
+  IgnoreEvents ignore;
+  int documents = 0;
+  while (documents < 2 && parser.HandleNextDocument(ignore)) ++documents;
+  return documents;
 }
 
 YAML::Node copyNode(const YAML::Node& node, int depth, std::size_t* nodes,
@@ -128,21 +157,18 @@ YAML::Node parseYaml(const std::string& text, const std::string& source_name) {
     fail(source_name, "is longer than " + std::to_string(kMaxBytes) + " bytes");
   }
   if (nestsTooDeeply(text)) fail(source_name, "nests too deeply for a configuration");
-  std::vector<YAML::Node> documents;
+  YAML::Node root;
   try {
-    documents = YAML::LoadAll(text);
+    const int documents = countDocuments(text);
+    if (documents > 1) fail(source_name, "must hold one YAML document and nothing beside it");
+    if (documents == 1) root = YAML::Load(text);
   } catch (const YAML::Exception& error) {
     if (error.mark.is_null()) fail(source_name, "is not YAML: " + error.msg);
     fail(source_name + ":" + std::to_string(error.mark.line + 1) + ":" +
              std::to_string(error.mark.column + 1),
          "is not YAML: " + error.msg);
   }
-  if (documents.size() > 1) {
-    fail(source_name,
-         "holds " + std::to_string(documents.size()) + " YAML documents; must hold one");
-  }
-  if (documents.empty() || documents[0].IsNull()) return YAML::Node(YAML::NodeType::Map);
-  return copyTree(documents[0], source_name);
+  return root.IsNull() ? YAML::Node(YAML::NodeType::Map) : copyTree(root, source_name);
 }
 
 YAML::Node parseYamlFile(const std::string& path) {

@@ -488,18 +488,22 @@ SelectorConfig Rig::selectorConfig() const {
   config.reference_camera = std::max(0, referenceCamera());
   config.reference_timeout_ns = toNs(reference.timeout_s);
   config.image_choice = image_choice;
-  StampNs longest_ns = config.reference_timeout_ns;
+  StampNs wait_ns = config.reference_timeout_ns;
+  StampNs reach_ns = config.reference_timeout_ns;
   for (const CameraConfig& camera : cameras) {
     SelectorCamera selector;
     selector.time_offset_ns = toNs(camera.time_offset_s);
     selector.max_time_difference_ns = toNs(camera.max_time_difference_s);
     selector.timeout_ns = toNs(camera.timeout_s);
     selector.reorder_window_ns = toNs(camera.reorder_window_s);
-    longest_ns = std::max(longest_ns, selector.timeout_ns + selector.max_time_difference_ns);
+    wait_ns = std::max(wait_ns, selector.timeout_ns);
+    reach_ns = std::max(reach_ns, selector.max_time_difference_ns);
     config.cameras.push_back(selector);
   }
-  // A scan that waits the longest still finds its images.
-  config.image_history_ns = std::max(config.image_history_ns, longest_ns + kNsPerSecond);
+  // A scan that waits the longest still finds its images: t_ref is within reach of the scan and an
+  // image within reach of t_ref, to either side.
+  config.image_history_ns =
+      std::max(config.image_history_ns, wait_ns + 4 * reach_ns + kNsPerSecond);
   return config;
 }
 

@@ -79,7 +79,8 @@ FiringTimes hdl32e() {
   times.firing_ns = kHdlFiringNs;
   times.distance_unit_m = 0.002;
   for (int i = 0; i < 32; ++i) {
-    times.lasers[i].elevation_rad = (i % 2 == 0 ? kLowerDeg : kUpperDeg)[i / 2] * kRadPerDeg;
+    const double elevation_deg = i % 2 == 0 ? kLowerDeg[i / 2] : kUpperDeg[i / 2];
+    times.lasers[i].elevation_rad = elevation_deg * kRadPerDeg;
     times.lasers[i].time_ns = i * kHdlLaserNs;
   }
   numberRings(times);

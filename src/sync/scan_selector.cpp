@@ -11,8 +11,8 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-/// Bounds of memory where stamps are absurdly dense; 30 Hz for a minute are 1800 images.
-constexpr std::size_t kMaxImages = 4096;
+/// Bounds of memory where stamps are absurdly dense; 30 Hz for five minutes are 9000 images.
+constexpr std::size_t kMaxImages = 16384;
 constexpr std::size_t kMaxScans = 64;
 constexpr std::size_t kMaxSettled = 8;
 

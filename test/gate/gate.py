@@ -36,7 +36,7 @@ TRACES = [
         (r"double free|free\(\): invalid|malloc\(\): |corrupted (size|double)", "heap corruption"),
         (r"stack smashing detected|buffer overflow detected", "memory corruption"),
         (r"Assertion .* failed", "failed assertion"),
-        (r"Failed to load (nodelet|library)|failed to load", "a plugin did not load"),
+        (r"Failed to load (nodelet|library)|Could not load library", "a plugin did not load"),
         (r"REQUIRED process \[", "a required node ended"),
         (r"escalating to SIG(TERM|KILL)", "a node did not end when asked to"),
         (r"bad callback: ", "an exception in a callback of rospy"),

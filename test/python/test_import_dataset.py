@@ -523,6 +523,11 @@ BAD = [
         put_bytes(["os1_cloud_node_color_ply", "frame000001-1581624663_100.ply"], b"x"),
         "not a PLY file",
     ),
+    (
+        "rellis",
+        cut(["pylon_camera_node", "frame000001-1581624663_150.jpg"], 500),
+        "the JPEG is cut off",
+    ),
     ("rellis", replace(["poses.txt"], made.numbers(np.eye(4)[:3]) + "\n"), "1 poses"),
 ]
 
@@ -537,6 +542,18 @@ def test_one_line_errors_and_nothing_half_written(run_command, tmp_path, dataset
     assert code == 1, err
     assert err.count("\n") == 1 and "error: " in err and text in err, err
     assert os.listdir(str(out)) == []
+
+
+def test_bad_line_of_a_text_scan(run_command, tmp_path):
+    drive = made.kitti(tmp_path, unrectified=True)
+    path = os.path.join(drive, "velodyne_points", "data", "0000000001.txt")
+    for text, problem in (
+        ("1 2 3 4\n1 2 3\n", "line 2: 3 numbers"),
+        ("1 2 x 4\n", "line 1: could"),
+    ):
+        made.write(path, text)
+        code, _, err = run_command(SCRIPT, "kitti", drive, tmp_path / "a.bag")
+        assert code == 1 and err.count("\n") == 1 and problem in err, err
 
 
 def test_bad_options(run_command, tmp_path):

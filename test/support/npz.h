@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: MIT
 /// Reads numpy .npz archives (zip with stored or deflated .npy members, little-endian, C order).
-/// Link with zlib.
 #pragma once
 
-#include <zlib.h>
-
+#include <algorithm>
+#include <array>
 #include <cstdint>
 #include <cstring>
 #include <fstream>
@@ -12,6 +11,7 @@
 #include <map>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace semantic_lidar_fusion {
@@ -44,20 +44,131 @@ inline std::uint32_t get(const std::vector<std::uint8_t>& file, std::size_t at, 
   return value;
 }
 
-inline std::vector<std::uint8_t> inflated(const std::uint8_t* data, std::size_t size,
-                                          std::size_t inflated_size) {
-  std::vector<std::uint8_t> result(inflated_size);
-  z_stream stream{};
-  stream.next_in = const_cast<Bytef*>(data);
-  stream.avail_in = static_cast<uInt>(size);
-  stream.next_out = result.data();
-  stream.avail_out = static_cast<uInt>(inflated_size);
-  const bool good = inflateInit2(&stream, -MAX_WBITS) == Z_OK &&
-                    inflate(&stream, Z_FINISH) == Z_STREAM_END && stream.avail_out == 0;
-  inflateEnd(&stream);
-  if (!good) throw std::runtime_error("npz: cannot inflate");
-  return result;
-}
+/// A canonical Huffman code of RFC 1951, 3.2.2, as counts of codes by length and symbols in order.
+struct HuffmanCode {
+  std::array<int, 16> count{};
+  std::vector<int> symbols;
+
+  explicit HuffmanCode(const std::vector<int>& lengths) {
+    for (int length = 1; length < 16; ++length) {
+      for (std::size_t symbol = 0; symbol < lengths.size(); ++symbol) {
+        if (lengths[symbol] != length) continue;
+        ++count[length];
+        symbols.push_back(static_cast<int>(symbol));
+      }
+    }
+  }
+};
+
+/// Decoder of RFC 1951 data; slow and small.
+class Inflater {
+ public:
+  Inflater(const std::uint8_t* data, std::size_t size) : data_(data), size_(size) {}
+
+  std::vector<std::uint8_t> run() {
+    bool last = false;
+    while (!last) {
+      last = bits(1) == 1;
+      const int type = bits(2);
+      if (type == 0) {
+        stored();
+      } else if (type == 1) {
+        std::vector<int> lengths(288, 8);
+        std::fill(lengths.begin() + 144, lengths.begin() + 256, 9);
+        std::fill(lengths.begin() + 256, lengths.begin() + 280, 7);
+        compressed(HuffmanCode(lengths), HuffmanCode(std::vector<int>(30, 5)));
+      } else if (type == 2) {
+        dynamic();
+      } else {
+        throw std::runtime_error("deflate: unknown block type");
+      }
+    }
+    return std::move(out_);
+  }
+
+ private:
+  int bits(int count) {
+    int value = 0;
+    for (int i = 0; i < count; ++i, ++bit_) {
+      if (bit_ / 8 >= size_) throw std::runtime_error("deflate: data end too early");
+      value |= (data_[bit_ / 8] >> (bit_ % 8) & 1) << i;
+    }
+    return value;
+  }
+
+  int symbol(const HuffmanCode& code) {
+    int value = 0, first = 0, index = 0;
+    for (int length = 1; length < 16; ++length) {
+      value |= bits(1);
+      const int count = code.count[length];
+      if (value - count < first) return code.symbols.at(index + value - first);
+      index += count;
+      first = (first + count) << 1;
+      value <<= 1;
+    }
+    throw std::runtime_error("deflate: unknown code");
+  }
+
+  void stored() {
+    bit_ = (bit_ + 7) / 8 * 8;
+    const int length = bits(16);
+    bits(16);  // the complement
+    for (int i = 0; i < length; ++i) out_.push_back(static_cast<std::uint8_t>(bits(8)));
+  }
+
+  void dynamic() {
+    const int literal_count = bits(5) + 257;
+    const int distance_count = bits(5) + 1;
+    const int length_count = bits(4) + 4;
+    const int order[19] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
+    std::vector<int> code_lengths(19, 0);
+    for (int i = 0; i < length_count; ++i) code_lengths[order[i]] = bits(3);
+    const HuffmanCode code(code_lengths);
+    std::vector<int> lengths;
+    while (static_cast<int>(lengths.size()) < literal_count + distance_count) {
+      const int s = symbol(code);
+      if (s < 16) {
+        lengths.push_back(s);
+      } else if (s == 16) {
+        lengths.insert(lengths.end(), bits(2) + 3, int{lengths.at(lengths.size() - 1)});
+      } else {
+        lengths.insert(lengths.end(), s == 17 ? bits(3) + 3 : bits(7) + 11, 0);
+      }
+    }
+    compressed(HuffmanCode({lengths.begin(), lengths.begin() + literal_count}),
+               HuffmanCode({lengths.begin() + literal_count, lengths.end()}));
+  }
+
+  void compressed(const HuffmanCode& literals, const HuffmanCode& distances) {
+    for (int s = symbol(literals); s != 256; s = symbol(literals)) {
+      if (s < 256) {
+        out_.push_back(static_cast<std::uint8_t>(s));
+        continue;
+      }
+      int length = 258;  // symbol 285
+      if (s < 265) {
+        length = s - 254;
+      } else if (s < 285) {
+        const int extra = (s - 261) / 4;
+        length = (((s - 265) % 4 + 4) << extra) + 3 + bits(extra);
+      }
+      const int d = symbol(distances);
+      int distance = d + 1;
+      if (d > 3) {
+        const int extra = d / 2 - 1;
+        distance = ((d % 2 + 2) << extra) + 1 + bits(extra);
+      }
+      for (int i = 0; i < length; ++i) {
+        out_.push_back(std::uint8_t{out_.at(out_.size() - static_cast<std::size_t>(distance))});
+      }
+    }
+  }
+
+  const std::uint8_t* data_;
+  std::size_t size_;
+  std::size_t bit_ = 0;
+  std::vector<std::uint8_t> out_;
+};
 
 inline NpyArray parseNpy(const std::vector<std::uint8_t>& npy) {
   const std::size_t length_bytes = npy.at(6) == 1 ? 2 : 4;
@@ -111,8 +222,9 @@ inline std::map<std::string, NpyArray> readNpz(const std::string& path) {
     }
     const std::vector<std::uint8_t> npy =
         method == 8
-            ? npz_detail::inflated(file.data() + data, packed_size, size)
+            ? npz_detail::Inflater(file.data() + data, packed_size).run()
             : std::vector<std::uint8_t>(file.begin() + data, file.begin() + data + packed_size);
+    if (npy.size() != size) throw std::runtime_error("npz: size of " + name + " in " + path);
     arrays[name.substr(0, name.rfind(".npy"))] = npz_detail::parseNpy(npy);
     entry += 46 + name_length + get(file, entry + 30, 2) + get(file, entry + 32, 2);
   }

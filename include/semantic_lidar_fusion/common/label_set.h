@@ -38,8 +38,9 @@ class LabelSet {
   static constexpr int kMaxClasses = 255;
 
   LabelSet() = default;
-  /// Throws ConfigError with every problem (empty set, bad or duplicate names, unknown names in
-  /// discard or merge, unknown keys).
+  /// `root`: a class-set file's map, or its list of classes alone. Throws ConfigError with every
+  /// problem (empty set, bad or duplicate names, unknown names in discard or merge, a class in two
+  /// of them, a merged class named like a class that it does not hold, unknown keys).
   static LabelSet fromYaml(const YAML::Node& root, const std::string& source_name);
   static LabelSet fromFile(const std::string& path);
 
@@ -52,7 +53,7 @@ class LabelSet {
   /// Merge map for evaluation; a class that is neither merged nor discarded stands alone.
   const std::vector<MergedClass>& merged() const { return merged_; }
   /// The `class_info` message: {"classes": [{"id", "name", "color": [r, g, b], "dynamic"}],
-  /// "discard": [...], "merge": {...}}.
+  /// "discard": [names], "merge": {name: [names]}}.
   std::string toJson() const;
 
  private:

@@ -436,7 +436,7 @@ TEST(SemanticProjector, GivesTheSameBytesForEveryOrderOfCameras) {
   Scene scene(3);
   scene.cloud = [] {
     std::mt19937 random(3);
-    return randomScan(&random, 60);
+    return randomScan(&random, 40);
   }();
   // The front camera four times in slightly different poses: sums of four and more terms.
   const CameraView front = scene.views[0];
@@ -452,6 +452,7 @@ TEST(SemanticProjector, GivesTheSameBytesForEveryOrderOfCameras) {
     FusionConfig config;
     config.class_count = Scene::kClasses;
     config.overlap = rule;
+    config.occlusion.mode = OcclusionMode::kPaper;
     const SemanticProjector projector(config);
     std::vector<int> order(scene.views.size());
     std::iota(order.begin(), order.end(), 0);

@@ -1,0 +1,702 @@
+// SPDX-License-Identifier: MIT
+#include "semantic_lidar_fusion/projection/occlusion_mask.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <optional>
+
+#include "semantic_lidar_fusion/common/error.h"
+
+namespace semantic_lidar_fusion {
+
+namespace {
+
+constexpr double kPi = 3.14159265358979323846;
+constexpr float kTwoPi = 6.28318530717958647692f;
+
+/// How far a mask reaches where its surface ends, as a part of the way to the next beam. The end is
+/// somewhere in between: with r, (1 - r)^2 / 2 of a beam's hidden points slip through and r^2 / 2
+/// of its visible ones are lost, and a wrong label is worse than none.
+constexpr double kEdgeReach = 0.75;
+/// The same, up and down, for a return that continues on neither side: often a level surface seen
+/// edge-on (a roof), of which a tall mask would be wrong.
+constexpr double kLoneReach = 0.5;
+/// Neighbours closer in range than this, or than this part of their distance across the beam, lie
+/// on one surface.
+constexpr float kFlatRange_m = 0.1f;
+constexpr float kFlatSlope = 0.5f;
+/// Largest bend of a surface that goes on straight, and what range noise may add to it.
+constexpr double kStraight_rad = 5.0 * kPi / 180.0;
+constexpr float kRangeNoise_m = 0.06f;
+constexpr float kLargestBend_rad = 0.5f;
+/// Neighbours that must agree before a link is taken over from the column beside.
+constexpr int kCarryRun = 5;
+
+double radians(double degrees) { return degrees * kPi / 180.0; }
+
+double median(std::vector<float>* values) {
+  if (values->empty()) return 0.0;
+  const auto middle = values->begin() + static_cast<std::ptrdiff_t>(values->size() / 2);
+  std::nth_element(values->begin(), middle, values->end());
+  return *middle;
+}
+
+/// A cloud as rows of returns sorted by azimuth.
+struct RangeImage {
+  std::vector<float> azimuth, elevation, range;  ///< by cloud index
+  std::vector<std::uint16_t> row;                ///< by cloud index; kNoRing = not used
+  std::vector<std::uint32_t> order;              ///< cloud indices, row by row, azimuth ascending
+  std::vector<std::uint32_t> row_begin;          ///< into `order`, one more than rows
+  int rows() const { return static_cast<int>(row_begin.size()) - 1; }
+};
+
+RangeImage rangeImage(const Cloud& cloud, const OcclusionConfig& config) {
+  const std::size_t n = cloud.size();
+  RangeImage image;
+  image.azimuth.resize(n);
+  image.elevation.resize(n);
+  image.range.resize(n);
+  image.row.assign(n, kNoRing);
+  const auto no_odometry = static_cast<std::uint8_t>(PointStatus::kNoOdometry);
+  bool has_ring = false;
+  float lowest = std::numeric_limits<float>::max();
+  for (std::size_t i = 0; i < n; ++i) {
+    const float flat = std::sqrt(cloud.x[i] * cloud.x[i] + cloud.y[i] * cloud.y[i]);
+    image.azimuth[i] = std::atan2(cloud.y[i], cloud.x[i]);
+    image.elevation[i] = std::atan2(cloud.z[i], flat);
+    image.range[i] = std::sqrt(flat * flat + cloud.z[i] * cloud.z[i]);
+    if (cloud.status[i] == no_odometry || !(image.range[i] > 0.0f) ||
+        !std::isfinite(image.range[i])) {
+      image.range[i] = 0.0f;
+      continue;
+    }
+    has_ring = has_ring || cloud.ring[i] != kNoRing;
+    lowest = std::min(lowest, image.elevation[i]);
+  }
+  if (!has_ring && lowest < 4.0f && config.vertical_step_deg <= 0.0) {
+    throw DataError(
+        "field 'ring' is absent from the cloud and occlusion.vertical_step_deg = 0: masks need the "
+        "angle between rings; set occlusion.vertical_step_deg to it");
+  }
+  int rows = 0;
+  for (std::size_t i = 0; i < n; ++i) {
+    if (image.range[i] == 0.0f) continue;
+    if (has_ring) {
+      image.row[i] = cloud.ring[i];
+    } else {
+      const double step = radians(config.vertical_step_deg);
+      image.row[i] = static_cast<std::uint16_t>(
+          std::min(65534.0, std::floor((image.elevation[i] - lowest) / step + 0.5)));
+    }
+    if (image.row[i] != kNoRing) rows = std::max(rows, image.row[i] + 1);
+  }
+
+  image.row_begin.assign(static_cast<std::size_t>(rows) + 1, 0);
+  for (std::size_t i = 0; i < n; ++i) {
+    if (image.row[i] != kNoRing) ++image.row_begin[image.row[i] + 1u];
+  }
+  std::partial_sum(image.row_begin.begin(), image.row_begin.end(), image.row_begin.begin());
+  image.order.resize(image.row_begin.back());
+  std::vector<std::uint32_t> next(image.row_begin.begin(), image.row_begin.end() - 1);
+  for (std::size_t i = 0; i < n; ++i) {
+    if (image.row[i] != kNoRing) image.order[next[image.row[i]]++] = static_cast<std::uint32_t>(i);
+  }
+  for (int row = 0; row < rows; ++row) {
+    std::sort(
+        image.order.begin() + image.row_begin[row], image.order.begin() + image.row_begin[row + 1],
+        [&](std::uint32_t a, std::uint32_t b) {
+          return image.azimuth[a] != image.azimuth[b] ? image.azimuth[a] < image.azimuth[b] : a < b;
+        });
+  }
+  return image;
+}
+
+/// The most frequent step between sorted azimuths: gaps and dropouts make multiples of it, second
+/// returns make zeros.
+double azimuthStep(std::vector<float>* steps) {
+  constexpr float kSmallest = 3e-4f;  // 0.017 deg
+  constexpr double kBinsPerOctave = 8.0;
+  constexpr int kBins = 100;
+  std::vector<int> count(kBins + 2, 0);
+  for (const float step : *steps) {
+    if (step < kSmallest) continue;
+    const int bin = static_cast<int>(std::log2(step / kSmallest) * kBinsPerOctave);
+    if (bin < kBins) ++count[bin + 1];
+  }
+  int best = 0, best_bin = -1;
+  for (int bin = 1; bin <= kBins; ++bin) {
+    const int near = count[bin - 1] + 2 * count[bin] + count[bin + 1];
+    if (near > best) best = near, best_bin = bin;
+  }
+  if (best_bin < 0) return 0.0;
+  const double mode = kSmallest * std::exp2((best_bin - 0.5) / kBinsPerOctave);
+  steps->erase(std::remove_if(steps->begin(), steps->end(),
+                              [&](float s) { return s < 0.6 * mode || s > 1.5 * mode; }),
+               steps->end());
+  return median(steps);
+}
+
+void measureSteps(const RangeImage& image, const OcclusionConfig& config, BeamGrid* grid) {
+  constexpr std::size_t kEnough = 50;
+  const int rows = image.rows();
+  grid->rings.assign(static_cast<std::size_t>(rows), {});
+  std::vector<float> all, values;
+  std::vector<int> present;
+  for (int row = 0; row < rows; ++row) {
+    const std::uint32_t begin = image.row_begin[row], end = image.row_begin[row + 1];
+    if (begin == end) continue;
+    present.push_back(row);
+    values.clear();
+    for (std::uint32_t i = begin; i < end; ++i) values.push_back(image.elevation[image.order[i]]);
+    grid->rings[row].elevation_rad = median(&values);
+    values.clear();
+    for (std::uint32_t i = begin + 1; i < end; ++i) {
+      values.push_back(image.azimuth[image.order[i]] - image.azimuth[image.order[i - 1]]);
+    }
+    all.insert(all.end(), values.begin(), values.end());
+    if (values.size() >= kEnough) grid->rings[row].half_azimuth_rad = 0.5 * azimuthStep(&values);
+  }
+  if (present.empty()) return;
+
+  grid->horizontal_step_rad =
+      config.horizontal_step_deg > 0.0 ? radians(config.horizontal_step_deg) : azimuthStep(&all);
+  // Rings by elevation; ring numbers of some drivers are not in that order.
+  std::stable_sort(present.begin(), present.end(), [&](int a, int b) {
+    return grid->rings[a].elevation_rad < grid->rings[b].elevation_rad;
+  });
+  std::vector<float> gaps;
+  for (std::size_t i = 1; i < present.size(); ++i) {
+    const int missing = std::max(1, std::abs(present[i] - present[i - 1]));
+    const double gap =
+        grid->rings[present[i]].elevation_rad - grid->rings[present[i - 1]].elevation_rad;
+    gaps.push_back(static_cast<float>(gap / missing));
+  }
+  const std::vector<float> gap_above = gaps;
+  grid->vertical_step_rad =
+      config.vertical_step_deg > 0.0 ? radians(config.vertical_step_deg) : median(&gaps);
+  for (std::size_t i = 0; i < present.size(); ++i) {
+    BeamGrid::Ring& ring = grid->rings[present[i]];
+    if (config.horizontal_step_deg > 0.0 || ring.half_azimuth_rad <= 0.0) {
+      ring.half_azimuth_rad = 0.5 * grid->horizontal_step_rad;
+    }
+    const auto gap = [&](std::size_t g) {
+      return config.vertical_step_deg > 0.0 ? grid->vertical_step_rad
+                                            : static_cast<double>(gap_above[g]);
+    };
+    const bool lowest = i == 0, highest = i + 1 == present.size();
+    if (lowest && highest) {
+      ring.half_up_rad = ring.half_down_rad = 0.5 * grid->vertical_step_rad;
+    } else {
+      ring.half_up_rad = 0.5 * gap(highest ? i - 1 : i);
+      ring.half_down_rad = 0.5 * gap(lowest ? 0 : i - 1);
+    }
+  }
+}
+
+/// Finds for each return its neighbours and whether they lie on its surface.
+class Linker {
+ public:
+  Linker(const Cloud& cloud, const RangeImage& image, const OcclusionConfig& config,
+         const BeamGrid& grid)
+      : cloud_(cloud), image_(image), config_(config), grid_(grid) {}
+
+  std::vector<BeamGrid::Links> link() {
+    const std::size_t n = cloud_.size();
+    near_.assign(n, {kNone, kNone, kNone, kNone});
+    links_ = near_;
+    std::vector<int> rows;
+    for (int row = 0; row < image_.rows(); ++row) {
+      if (image_.row_begin[row] != image_.row_begin[row + 1]) rows.push_back(row);
+    }
+    std::stable_sort(rows.begin(), rows.end(), [&](int a, int b) {
+      return grid_.rings[a].elevation_rad < grid_.rings[b].elevation_rad;
+    });
+    for (std::size_t k = 0; k < rows.size(); ++k) {
+      findBeside(rows[k]);
+      if (k > 0) findAcross(rows[k], rows[k - 1], &Links::down);
+      if (k + 1 < rows.size()) findAcross(rows[k], rows[k + 1], &Links::up);
+    }
+    for (const std::uint32_t i : image_.order) {
+      keepSameSurface(i, &Links::left, &Links::right);
+      keepSameSurface(i, &Links::right, &Links::left);
+      keepSameSurface(i, &Links::up, &Links::down);
+      keepSameSurface(i, &Links::down, &Links::up);
+    }
+    for (const int row : rows) {
+      for (const bool to_left : {true, false}) {
+        carryAlong(row, to_left, &Links::up);
+        carryAlong(row, to_left, &Links::down);
+      }
+    }
+    return std::move(links_);
+  }
+
+ private:
+  using Links = BeamGrid::Links;
+  using Side = std::int32_t Links::*;
+  static constexpr std::int32_t kNone = BeamGrid::kNoLink;
+
+  float stepOf(int row) const {
+    return static_cast<float>(2.0 * grid_.rings[row].half_azimuth_rad);
+  }
+
+  /// Difference of azimuths counter-clockwise, 0..2 pi.
+  static float turn(float from, float to) {
+    const float d = to - from;
+    return d < 0.0f ? d + kTwoPi : d;
+  }
+
+  /// The next return left (counter-clockwise seen from above) and right in the same row, over a gap
+  /// of one missing return; of several at one azimuth (second returns) the closest in range.
+  void findBeside(int row) {
+    const std::uint32_t begin = image_.row_begin[row];
+    const std::uint32_t count = image_.row_begin[row + 1] - begin;
+    const float least = 0.3f * stepOf(row), most = 2.6f * stepOf(row), same = 0.3f * stepOf(row);
+    for (std::uint32_t k = 0; k < count; ++k) {
+      const std::uint32_t i = image_.order[begin + k];
+      for (const bool to_left : {true, false}) {
+        float best = std::numeric_limits<float>::max();
+        float first = most;
+        for (std::uint32_t hop = 1; hop < count; ++hop) {
+          const std::uint32_t place = to_left ? k + hop : k + count - hop;
+          const std::uint32_t j = image_.order[begin + (place < count ? place : place - count)];
+          const float d = to_left ? turn(image_.azimuth[i], image_.azimuth[j])
+                                  : turn(image_.azimuth[j], image_.azimuth[i]);
+          if (d > std::min(most, first + same)) break;
+          if (d < least) continue;
+          first = std::min(first, d);
+          const float difference = std::abs(image_.range[j] - image_.range[i]);
+          if (difference < best) {
+            best = difference;
+            (to_left ? near_[i].left : near_[i].right) = static_cast<std::int32_t>(j);
+          }
+        }
+      }
+    }
+  }
+
+  /// The return of the row `other` that lies over or under each of `row`; of several the closest in
+  /// range.
+  void findAcross(int row, int other, Side side) {
+    const std::uint32_t other_begin = image_.row_begin[other];
+    const std::uint32_t count = image_.row_begin[other + 1] - other_begin;
+    const float window = std::min(0.75f * std::max(stepOf(row), stepOf(other)), 3.0f);
+    const auto at = [&](std::uint32_t k) { return image_.order[other_begin + k]; };
+    std::uint32_t start = 0;
+    for (std::uint32_t k = image_.row_begin[row]; k < image_.row_begin[row + 1]; ++k) {
+      const std::uint32_t i = image_.order[k];
+      const float azimuth = image_.azimuth[i];
+      float best = std::numeric_limits<float>::max();
+      const auto consider = [&](std::uint32_t j) {
+        const float difference = std::abs(image_.range[j] - image_.range[i]);
+        if (difference < best) {
+          best = difference;
+          near_[i].*side = static_cast<std::int32_t>(j);
+        }
+      };
+      while (start < count && image_.azimuth[at(start)] < azimuth - window) ++start;
+      for (std::uint32_t m = start; m < count && image_.azimuth[at(m)] <= azimuth + window; ++m) {
+        consider(at(m));
+      }
+      // Across the jump of the azimuth at the back.
+      for (std::uint32_t m = 0; m < count && image_.azimuth[at(m)] + kTwoPi <= azimuth + window;
+           ++m) {
+        consider(at(m));
+      }
+      for (std::uint32_t m = count; m > 0 && image_.azimuth[at(m - 1)] - kTwoPi >= azimuth - window;
+           --m) {
+        consider(at(m - 1));
+      }
+    }
+  }
+
+  void keepSameSurface(std::uint32_t i, Side side, Side opposite) {
+    const std::int32_t j = near_[i].*side;
+    if (j != kNone && sameSurface(static_cast<std::int32_t>(i), j, near_[i].*opposite,
+                                  near_[static_cast<std::size_t>(j)].*side)) {
+      links_[i].*side = j;
+    }
+  }
+
+  Eigen::Vector3f point(std::int32_t i) const {
+    const auto k = static_cast<std::size_t>(i);
+    return {cloud_.x[k], cloud_.y[k], cloud_.z[k]};
+  }
+
+  static bool straight(const Eigen::Vector3f& a, const Eigen::Vector3f& b) {
+    const float length_a = a.norm(), length_b = b.norm();
+    const float noise = kRangeNoise_m / std::max(1e-3f, std::min(length_a, length_b));
+    const float bend = std::min(static_cast<float>(kStraight_rad) + noise, kLargestBend_rad);
+    return a.dot(b) >= std::cos(bend) * length_a * length_b;
+  }
+
+  /// Whether neighbours a and b lie on one surface; `before` is a's neighbour away from b, `after`
+  /// is b's away from a.
+  bool sameSurface(std::int32_t a, std::int32_t b, std::int32_t before, std::int32_t after) const {
+    const float range_a = image_.range[a], range_b = image_.range[b];
+    const float jump = std::abs(range_a - range_b), nearest = std::min(range_a, range_b);
+    const float across = (point(a) / range_a - point(b) / range_b).norm() * nearest;
+    if (jump <= std::max(kFlatRange_m, kFlatSlope * across)) return true;
+    // Beside each other the beams are so close that a slanted link hides nothing wrongly; between
+    // rings it would cut off the corner of a box.
+    if (image_.row[a] == image_.row[b] &&
+        jump <= std::max(config_.depth_margin_m, config_.depth_margin_ratio * nearest)) {
+      return true;
+    }
+    // A plane at a grazing angle goes on straight. The nearer point's side of the link is the
+    // witness: a farther surface seen over an edge may happen to lie in line with it.
+    const Eigen::Vector3f step = point(b) - point(a);
+    const bool from_before = range_a <= range_b ? before != kNone : after == kNone;
+    if (from_before) return before != kNone && straight(point(a) - point(before), step);
+    return after != kNone && straight(step, point(after) - point(b));
+  }
+
+  /// Where only two rings meet the ground in front of an object nothing tells whether their link is
+  /// straight: then it is like its neighbour's, if a run of neighbours has one.
+  void carryAlong(int row, bool to_left, Side side) {
+    const std::uint32_t begin = image_.row_begin[row];
+    const std::uint32_t count = image_.row_begin[row + 1] - begin;
+    int run = 0;
+    float slope = 0.0f, jump = 0.0f;
+    std::int32_t last = kNone;
+    for (std::uint32_t n = 0; n < 2 * count; ++n) {  // twice around: the start has a run too
+      const std::uint32_t k = n < count ? n : n - count;
+      const auto i = static_cast<std::int32_t>(image_.order[begin + (to_left ? k : count - 1 - k)]);
+      Links& own = links_[static_cast<std::size_t>(i)];
+      if (last == kNone || (to_left ? own.right : own.left) != last) run = 0;
+      last = i;
+      const std::int32_t j = near_[static_cast<std::size_t>(i)].*side;
+      if (j == kNone) {
+        run = 0;
+        continue;
+      }
+      const Eigen::Vector3f step = point(j) - point(i);
+      const float own_slope = std::atan2(step.z(), step.head<2>().norm());
+      const float own_jump = image_.range[j] - image_.range[i];
+      const bool alike = run >= kCarryRun &&
+                         std::abs(own_slope - slope) <= static_cast<float>(kStraight_rad) &&
+                         std::abs(own_jump - jump) <= std::max(0.2f, 0.25f * std::abs(jump));
+      if (own.*side == kNone && alike) own.*side = j;
+      run = own.*side != kNone ? run + 1 : 0;
+      slope = own_slope;
+      jump = own_jump;
+    }
+  }
+
+  const Cloud& cloud_;
+  const RangeImage& image_;
+  const OcclusionConfig& config_;
+  const BeamGrid& grid_;
+  std::vector<Links> near_;   ///< neighbours, of whatever surface
+  std::vector<Links> links_;  ///< those of the same surface
+};
+
+/// Points in the order of visiting: nearest first, ties by lower index.
+std::vector<std::uint32_t> nearestFirst(const ProjectedPoints& points) {
+  std::vector<std::uint32_t> order(points.size());
+  std::iota(order.begin(), order.end(), 0u);
+  std::sort(order.begin(), order.end(), [&](std::uint32_t a, std::uint32_t b) {
+    return points.distance[a] != points.distance[b] ? points.distance[a] < points.distance[b]
+                                                    : points.index[a] < points.index[b];
+  });
+  return order;
+}
+
+std::vector<std::uint8_t> visibleByPaper(const ProjectedPoints& points, const CameraModel& camera,
+                                         const MaskSize& mask) {
+  const int width = camera.imageSize().width, height = camera.imageSize().height;
+  const int half_width = (mask.width - 1) / 2, half_height = (mask.height - 1) / 2;
+  // One bit a pixel, columns contiguous: masks are tall.
+  const std::size_t words = (static_cast<std::size_t>(height) + 63) / 64;
+  std::vector<std::uint64_t> masked(words * static_cast<std::size_t>(width), 0);
+  std::vector<std::uint8_t> visible(points.size(), 0);
+  for (const std::uint32_t i : nearestFirst(points)) {
+    if (!inImage(points.u[i], points.v[i], camera.imageSize())) continue;
+    const int u = pixelIndex(points.u[i]), v = pixelIndex(points.v[i]);
+    const std::uint64_t* own = masked.data() + words * static_cast<std::size_t>(u);
+    if (own[v / 64] >> (v % 64) & 1u) continue;
+    visible[i] = 1;
+    const int top = std::max(0, v - half_height), bottom = std::min(height - 1, v + half_height);
+    for (int x = std::max(0, u - half_width); x <= std::min(width - 1, u + half_width); ++x) {
+      std::uint64_t* column = masked.data() + words * static_cast<std::size_t>(x);
+      for (int word = top / 64; word <= bottom / 64; ++word) {
+        const int from = std::max(top - 64 * word, 0), to = std::min(bottom - 64 * word, 63);
+        column[word] |= (~std::uint64_t{0} >> (63 - to + from)) << from;
+      }
+    }
+  }
+  return visible;
+}
+
+/// Masks of mode `adaptive`: a buffer of the nearest mask on each pixel. Where the masks are tall
+/// the buffer holds one cell for several pixels along them.
+class SurfaceMasks {
+ public:
+  SurfaceMasks(const Cloud& cloud, const ProjectedPoints& points, const Transform& T_camera_lidar,
+               const CameraModel& camera, const BeamGrid& grid, const OcclusionConfig& config)
+      : cloud_(cloud),
+        points_(points),
+        T_camera_lidar_(T_camera_lidar),
+        camera_(camera),
+        grid_(grid),
+        config_(config),
+        slot_(cloud.size(), -1) {
+    constexpr double kCellsPerStep = 10.0;
+    constexpr int kLargestCell_px = 8;
+    const Eigen::Vector3d up = T_camera_lidar.linear().col(2);
+    const auto cell = [&](double upright, double focal_px) {
+      const double px = focal_px * grid.vertical_step_rad / kCellsPerStep;
+      return upright < 0.8 ? 1
+                           : std::max(1, static_cast<int>(std::min<double>(px, kLargestCell_px)));
+    };
+    cell_x_ = cell(std::abs(up.x()), camera.fx());
+    cell_y_ = cell(std::abs(up.y()), camera.fy());
+    columns_ = (camera.imageSize().width + cell_x_ - 1) / cell_x_;
+    rows_ = (camera.imageSize().height + cell_y_ - 1) / cell_y_;
+    nearness_.assign(static_cast<std::size_t>(columns_) * static_cast<std::size_t>(rows_), 0.0f);
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      slot_[points.index[i]] = static_cast<std::int32_t>(i);
+    }
+  }
+
+  std::vector<std::uint8_t> visible() {
+    for (std::size_t i = 0; i < points_.size(); ++i) cast(i);
+    std::vector<std::uint8_t> result(points_.size(), 0);
+    for (std::size_t i = 0; i < points_.size(); ++i) {
+      if (!inImage(points_.u[i], points_.v[i], camera_.imageSize())) continue;
+      const int x = pixelIndex(points_.u[i]) / cell_x_, y = pixelIndex(points_.v[i]) / cell_y_;
+      const float nearness = column(x)[y];
+      const double near = 1.0 / static_cast<double>(nearness);
+      const double margin = std::max(config_.depth_margin_m, config_.depth_margin_ratio * near);
+      result[i] = nearness > 0.0f && points_.distance[i] > near + margin ? 0 : 1;
+    }
+    return result;
+  }
+
+ private:
+  struct Sample {
+    Eigen::Vector2f pixel;
+    float nearness = 0;  ///< 1 / distance to the camera
+  };
+  /// End of a mask in one direction.
+  struct Arm {
+    Eigen::Vector2f offset = Eigen::Vector2f::Zero();  ///< px, from the point
+    float nearness = 0;
+  };
+
+  float* column(int x) {
+    return nearness_.data() + static_cast<std::size_t>(x) * static_cast<std::size_t>(rows_);
+  }
+
+  Sample sampleOf(std::size_t i) const {
+    return {{points_.u[i], points_.v[i]}, 1.0f / std::max(points_.distance[i], 1e-3f)};
+  }
+
+  std::optional<Sample> sampleAt(const Eigen::Vector3d& p_lidar) const {
+    const Eigen::Vector3d p_camera = T_camera_lidar_ * p_lidar;
+    const auto pixel = camera_.project(p_camera);
+    if (!pixel) return std::nullopt;
+    const double distance = (p_camera - camera_.opticalCentre()).norm();
+    return Sample{pixel->cast<float>(), static_cast<float>(1.0 / std::max(distance, 1e-3))};
+  }
+
+  Eigen::Vector3d point(std::int32_t i) const {
+    const auto k = static_cast<std::size_t>(i);
+    return {cloud_.x[k], cloud_.y[k], cloud_.z[k]};
+  }
+
+  /// Half-way to a neighbour on the same surface. Inverse distance is linear in the image on a
+  /// plane.
+  Arm armTo(const Sample& own, std::int32_t link) const {
+    const std::int32_t slot = slot_[static_cast<std::size_t>(link)];
+    const std::optional<Sample> other =
+        slot >= 0 ? sampleOf(static_cast<std::size_t>(slot)) : sampleAt(point(link));
+    if (!other) return {Eigen::Vector2f::Zero(), own.nearness};
+    return {0.5f * (other->pixel - own.pixel), 0.5f * (other->nearness + own.nearness)};
+  }
+
+  /// To where the surface may end, turned from the beam by the given angles (one of them is 0). It
+  /// goes on straight from the neighbour `opposite`, or else at the same range.
+  Arm armToEdge(const Sample& own, std::int32_t self, std::int32_t opposite, double azimuth_rad,
+                double elevation_rad) const {
+    const Eigen::Vector3d p = point(self);
+    const double range = p.norm(), flat = std::hypot(p.x(), p.y());
+    const double azimuth = std::atan2(p.y(), p.x()) + azimuth_rad;
+    const double elevation = std::atan2(p.z(), flat) + elevation_rad;
+    double inverse = 1.0 / range;
+    if (opposite != BeamGrid::kNoLink) {
+      const Eigen::Vector3d q = point(opposite);
+      const double between = std::atan2(p.cross(q).norm(), p.dot(q));
+      const double reach = std::hypot(azimuth_rad * flat / range, elevation_rad);
+      // No nearer than the margin, so that noise makes no near mask; no farther than four times.
+      const double margin = std::max(config_.depth_margin_m, config_.depth_margin_ratio * range);
+      const double most = 1.0 / std::max(0.5 * range, range - margin);
+      if (between > 1e-6) inverse += (1.0 / range - 1.0 / q.norm()) * reach / between;
+      inverse = std::min(std::max(inverse, 0.25 / range), most);
+    }
+    const auto end =
+        sampleAt(Eigen::Vector3d(std::cos(elevation) * std::cos(azimuth),
+                                 std::cos(elevation) * std::sin(azimuth), std::sin(elevation)) /
+                 inverse);
+    if (!end) return {Eigen::Vector2f::Zero(), own.nearness};
+    return {end->pixel - own.pixel, end->nearness};
+  }
+
+  void cast(std::size_t i) {
+    constexpr std::int32_t kNone = BeamGrid::kNoLink;
+    const std::uint32_t index = points_.index[i];
+    if (grid_.ring[index] == kNoRing) return;
+    const BeamGrid::Ring& ring = grid_.rings[grid_.ring[index]];
+    const BeamGrid::Links& links = grid_.links[index];
+    const auto self = static_cast<std::int32_t>(index);
+    const bool lone = links.up == kNone && links.down == kNone;
+    const bool alone = lone && links.left == kNone && links.right == kNone;
+    const double tall = 2.0 * (lone ? kLoneReach : kEdgeReach);
+    const double wide = 2.0 * (alone ? kLoneReach : kEdgeReach) * ring.half_azimuth_rad;
+    const Sample own = sampleOf(i);
+    const Arm left =
+        links.left != kNone ? armTo(own, links.left) : armToEdge(own, self, links.right, wide, 0.0);
+    const Arm right = links.right != kNone ? armTo(own, links.right)
+                                           : armToEdge(own, self, links.left, -wide, 0.0);
+    const Arm up = links.up != kNone
+                       ? armTo(own, links.up)
+                       : armToEdge(own, self, links.down, 0.0, tall * ring.half_up_rad);
+    const Arm down = links.down != kNone
+                         ? armTo(own, links.down)
+                         : armToEdge(own, self, links.up, 0.0, -tall * ring.half_down_rad);
+    castHalf(own, left, right, up);
+    castHalf(own, left, right, down);
+  }
+
+  /// Enters the parallelogram from the left to the right arm's end, swept along the arm `along`,
+  /// rounded outwards by half a pixel.
+  void castHalf(const Sample& own, const Arm& left, const Arm& right, const Arm& along) {
+    const Eigen::Vector2f across = 0.5f * (right.offset - left.offset);
+    const Eigen::Vector2f centre = own.pixel + 0.5f * (right.offset + left.offset);
+    // Pixel = centre + s * across + t * along, s in -1..1, t in 0..1
+    const float det = across.x() * along.offset.y() - across.y() * along.offset.x();
+    if (!(std::abs(det) >= 1e-3f * (across.norm() + along.offset.norm()))) return;  // edge-on
+    const float s_x = along.offset.y() / det, s_y = -along.offset.x() / det;
+    const float t_x = -across.y() / det, t_y = across.x() / det;
+    const float s_slack = 0.5f * (std::abs(s_x) + std::abs(s_y));
+    const float t_slack = 0.5f * (std::abs(t_x) + std::abs(t_y));
+
+    const float s_gain = 0.5f * (right.nearness - left.nearness);
+    const float t_gain = along.nearness - own.nearness;
+    const float gain_y = s_gain * s_y + t_gain * t_y;
+    const float least = std::min(own.nearness, along.nearness) - std::abs(s_gain);
+    const float most = std::max(own.nearness, along.nearness) + std::abs(s_gain);
+
+    // A cell stands for its middle.
+    const float cell_x = static_cast<float>(cell_x_), cell_y = static_cast<float>(cell_y_);
+    const float middle_x = 0.5f * (cell_x - 1.0f), middle_y = 0.5f * (cell_y - 1.0f);
+    const float x_low = centre.x() - std::abs(across.x()) + std::min(0.0f, along.offset.x()) - 1.0f;
+    const float x_high =
+        centre.x() + std::abs(across.x()) + std::max(0.0f, along.offset.x()) + 1.0f;
+    const int x_begin = toCell((x_low - middle_x) / cell_x, columns_);
+    const int x_end = toCell((x_high - middle_x) / cell_x + 1.0f, columns_);
+    for (int x = x_begin; x < x_end; ++x) {
+      const float dx = static_cast<float>(x) * cell_x + middle_x - centre.x();
+      float low = -1e6f, high = 1e6f;
+      clip(s_x * dx, s_y, -1.0f - s_slack, 1.0f + s_slack, &low, &high);
+      clip(t_x * dx, t_y, -t_slack, 1.0f + t_slack, &low, &high);
+      const float zero = centre.y() - middle_y;
+      const int y_begin = toCell(std::ceil((zero + low) / cell_y), rows_);
+      const int y_end = toCell(std::floor((zero + high) / cell_y) + 1.0f, rows_);
+      const float at_zero = own.nearness + s_gain * s_x * dx + t_gain * t_x * dx - gain_y * zero;
+      float* cells = column(x);
+      for (int y = y_begin; y < y_end; ++y) {
+        const float nearness = at_zero + gain_y * cell_y * static_cast<float>(y);
+        cells[y] = std::max(cells[y], std::min(most, std::max(least, nearness)));
+      }
+    }
+  }
+
+  static int toCell(float at, int count) {
+    return static_cast<int>(std::max(0.0f, std::min(at, static_cast<float>(count))));
+  }
+
+  /// Narrows low..high to the y at which start + slope * y lies in least..most.
+  static void clip(float start, float slope, float least, float most, float* low, float* high) {
+    if (std::abs(slope) < 1e-9f) {
+      if (!(start >= least && start <= most)) *high = *low - 1.0f;
+      return;
+    }
+    const float a = (least - start) / slope, b = (most - start) / slope;
+    *low = std::max(*low, std::min(a, b));
+    *high = std::min(*high, std::max(a, b));
+  }
+
+  const Cloud& cloud_;
+  const ProjectedPoints& points_;
+  const Transform& T_camera_lidar_;
+  const CameraModel& camera_;
+  const BeamGrid& grid_;
+  const OcclusionConfig& config_;
+  std::vector<std::int32_t> slot_;  ///< by cloud index: place in `points_`, -1 = none
+  int cell_x_ = 1, cell_y_ = 1;     ///< px
+  int columns_ = 0, rows_ = 0;
+  std::vector<float> nearness_;  ///< largest 1 / distance of a mask per cell, columns contiguous
+};
+
+}  // namespace
+
+BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config) {
+  BeamGrid grid;
+  if (config.mode == OcclusionMode::kOff) return grid;
+  RangeImage image = rangeImage(cloud, config);
+  measureSteps(image, config, &grid);
+  if (config.vertical_step_deg > 0.0) grid.vertical_step_rad = radians(config.vertical_step_deg);
+  if (config.horizontal_step_deg > 0.0) {
+    grid.horizontal_step_rad = radians(config.horizontal_step_deg);
+  }
+  if (config.mode == OcclusionMode::kAdaptive) {
+    grid.links = Linker(cloud, image, config, grid).link();
+    grid.ring = std::move(image.row);
+  }
+  return grid;
+}
+
+MaskSize paperMaskSize(const CameraModel& camera, double horizontal_step_rad,
+                       double vertical_step_rad) {
+  const auto odd = [](double gap) {
+    if (!(gap > 1.0)) return 1;
+    const int up = static_cast<int>(std::ceil(std::min(gap, 1e6)));
+    return std::max(1, std::min(up | 1, 2 * static_cast<int>(std::floor(std::min(gap, 1e6))) - 1));
+  };
+  return {odd(camera.fx() * std::tan(horizontal_step_rad)),
+          odd(camera.fy() * std::tan(vertical_step_rad))};
+}
+
+double castMarginPx(const CameraModel& camera, const BeamGrid& grid,
+                    const OcclusionConfig& config) {
+  if (config.mode != OcclusionMode::kAdaptive) return 0.0;
+  double step = std::max(grid.horizontal_step_rad, grid.vertical_step_rad);
+  for (const BeamGrid::Ring& ring : grid.rings) {
+    step = std::max({step, 2.0 * ring.half_up_rad, 2.0 * ring.half_down_rad});
+  }
+  return std::max(camera.fx(), camera.fy()) * step;
+}
+
+std::vector<std::uint8_t> visiblePoints(const Cloud& cloud, const ProjectedPoints& points,
+                                        const Transform& T_camera_lidar, const CameraModel& camera,
+                                        const BeamGrid& grid, const OcclusionConfig& config) {
+  switch (config.mode) {
+    case OcclusionMode::kOff:
+      break;
+    case OcclusionMode::kPaper:
+      return visibleByPaper(
+          points, camera, paperMaskSize(camera, grid.horizontal_step_rad, grid.vertical_step_rad));
+    case OcclusionMode::kAdaptive:
+      if (grid.links.size() != cloud.size()) {
+        throw DataError("beam grid of " + std::to_string(grid.links.size()) + " points for " +
+                        std::to_string(cloud.size()) + ": must be that of the same cloud");
+      }
+      return SurfaceMasks(cloud, points, T_camera_lidar, camera, grid, config).visible();
+  }
+  return std::vector<std::uint8_t>(points.size(), 1);
+}
+
+}  // namespace semantic_lidar_fusion
