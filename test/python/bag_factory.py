@@ -135,12 +135,19 @@ class Drive:
         """T_vehicle_lidar."""
         return matrix(1.0, 0.0, 0.5, yaw(0.05))
 
+    def poses(self, t: np.ndarray) -> np.ndarray:
+        """T_fixed_vehicle (n, 4, 4) at t (n,) s after START_NS; constant twist, near the middle."""
+        w = self.yaw_rate if self.yaw_rate else 1e-12
+        result = np.tile(np.eye(4), (len(t), 1, 1))
+        c, s = np.cos(w * t), np.sin(w * t)
+        result[:, 0, 0], result[:, 0, 1], result[:, 1, 0], result[:, 1, 1] = c, -s, s, c
+        result[:, 0, 3] = self.origin[0] - 4.0 + self.speed * s / w
+        result[:, 1, 3] = self.origin[1] - 1.0 + self.speed * (1 - c) / w
+        return result
+
     def pose(self, t: float) -> np.ndarray:
-        """T_fixed_vehicle at t s after START_NS; constant twist, in the middle of the room."""
-        w = self.yaw_rate
-        x = self.speed * (np.sin(w * t) / w if w else t)
-        y = self.speed * ((1 - np.cos(w * t)) / w if w else 0.0)
-        return matrix(self.origin[0] + x - 4.0, self.origin[1] + y - 1.0, 0.0, yaw(w * t))
+        """T_fixed_vehicle at t s after START_NS."""
+        return self.poses(np.array([t]))[0]
 
     def scan_start_ns(self, index: int) -> int:
         """Time of the first point of a scan."""
@@ -207,7 +214,7 @@ class Drive:
 
     def cast_lidar(self, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Ranges (n,) of unit directions (n, 3) in the lidar's frame, each at its own time (n,)."""
-        poses = np.stack([self.pose(t) @ self.lidar_pose for t in times])
+        poses = self.poses(times) @ self.lidar_pose
         world = np.einsum("nij,nj->ni", poses[:, :3, :3], directions)
         return self.cast(poses[:, :3, 3], world)
 
