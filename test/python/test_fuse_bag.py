@@ -37,7 +37,7 @@ def run(*arguments, **options):
         stderr=subprocess.PIPE,
         universal_newlines=True,
         timeout=120,
-        **options
+        **options,
     )
 
 
@@ -334,11 +334,15 @@ def test_missing_camera_affects_only_itself(tmp_path, fused):
     other = made.fuse()
     assert all(m.time_ref.to_nsec() == 0 for m in other.of("/left/selection"))
     statuses = set()
-    for cloud, whole in zip(other.clouds(), fused.clouds()):
+    left = made.drive.cameras[1]
+    for message, cloud, whole in zip(other.of("/points_semantic"), other.clouds(), fused.clouds()):
         alone = whole["cameras"] == 1
         assert np.array_equal(cloud["label"][alone], whole["label"][alone])
-        only_left = whole["cameras"] == 2
-        assert (cloud["status"][only_left] == 3).all()
+        # Status 3 is judged with the camera where it was at t_ref.
+        t_ref = message.header.stamp.to_nsec()
+        uv, inside = pixels_in(made.drive, left, world_points(made.drive, cloud, t_ref), t_ref)
+        certain = (margin_to_border(left, uv) > 0.3) & ~np.isin(cloud["status"], (0, 1))
+        assert np.array_equal((cloud["status"] == 3)[certain], inside[certain])
         statuses |= set(cloud["status"])
     assert statuses >= {0, 2, 3}
     assert "/left/image" in other.result.stderr
@@ -414,10 +418,9 @@ def test_empty_scan_gives_empty_clouds_with_its_header(tmp_path):
 def test_one_image_can_serve_two_scans(tmp_path):
     cameras = [
         Camera("front", 0.0, (1.5, 0.1, 0.2)),
-        Camera("left", np.pi / 2, (0.8, 0.6, 0.1), phase_ns=100_000_000, period_ns=200_000_000),
+        Camera("left", np.pi / 2, (0.8, 0.6, 0.1), period_ns=200_000_000),
     ]
-    extra = "image_choice: closest_to_reference\n"
-    made = Made(tmp_path, Drive(scans=2, cameras=cameras), extra)
+    made = Made(tmp_path, Drive(scans=2, cameras=cameras))
     fused = made.fuse("--all", "--set", "cameras.left.max_time_difference=0.06")
     chosen = [m.time_ref.to_nsec() for m in fused.of("/left/selection")]
     assert len(set(chosen)) == 1
