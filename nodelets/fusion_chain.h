@@ -75,7 +75,7 @@ class FusionChain {
   Rig rig_;
   std::vector<Camera> cameras_;
   std::unique_ptr<SegmentationModel> model_;
-  std::unique_ptr<SemanticProjector> projector_;
+  std::unique_ptr<SemanticProjector> projector_;  ///< null for a rig without classes
 };
 
 FusionConfig fusionConfig(const Rig& rig);

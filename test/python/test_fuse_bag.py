@@ -428,6 +428,150 @@ def test_one_image_can_serve_two_scans(tmp_path):
     check_truth(made.drive, fused, 1e-3, 0.9)
 
 
+def test_camera_with_a_clock_of_its_own(tmp_path, fused):
+    cameras = bag_factory.default_cameras()
+    cameras[1].clock_ahead_ns = 30_000_000
+    other = Made(tmp_path, Drive(cameras=cameras)).fuse()
+    for ours, theirs in zip(other.of("/points_semantic"), fused.of("/points_semantic")):
+        assert ours.data == theirs.data
+    for ours, theirs in zip(other.of("/left/selection"), fused.of("/left/selection")):
+        assert ours.time_ref.to_nsec() == theirs.time_ref.to_nsec() + 30_000_000
+
+
+def test_reference_camera_with_a_clock_of_its_own(tmp_path, fused):
+    cameras = bag_factory.default_cameras()
+    cameras[0].clock_ahead_ns = -40_000_000
+    other = Made(tmp_path, Drive(cameras=cameras)).fuse()
+    for ours, theirs in zip(other.of("/points_semantic"), fused.of("/points_semantic")):
+        assert ours.header.stamp == theirs.header.stamp  # true time
+        assert ours.data == theirs.data
+
+
+def test_closest_to_sweep_takes_the_image_of_the_beams(tmp_path):
+    cameras = bag_factory.default_cameras()
+    cameras[1].period_ns = 20_000_000
+    made = Made(tmp_path, Drive(scans=2, cameras=cameras), "image_choice: closest_to_sweep\n")
+    fused = made.fuse()
+    differs = False
+    for index in range(made.drive.scans):
+        points, _, after_ns = made.drive.scan_points(index)
+        t_ref = fused.of("/scan_reference")[index].time_ref.to_nsec()
+        for camera in made.drive.cameras:
+            T = np.linalg.inv(camera.pose()) @ made.drive.lidar_pose
+            uv, _ = camera.project(points @ T[:3, :3].T + T[:3, 3])
+            inside = (uv > -0.5).all(axis=1)
+            inside &= (uv < [camera.width - 0.5, camera.height - 0.5]).all(axis=1)
+            target = made.drive.scan_start_ns(index) + int(after_ns[inside].mean())
+            stamps = made.drive.image_stamps_ns(camera)
+            chosen = fused.of("/%s/selection" % camera.name)[index].time_ref.to_nsec()
+            assert chosen == min(stamps, key=lambda s: (abs(s - target), s))
+            differs |= chosen != min(stamps, key=lambda s: (abs(s - t_ref), s))
+    assert differs
+    check_truth(made.drive, fused, 1e-3, 0.9)
+
+
+def test_ego_mask_never_transfers(room, tmp_path):
+    import cv2
+
+    camera = room.drive.cameras[0]
+    mask = np.full((camera.height, camera.width), 255, np.uint8)
+    mask[:, : camera.width // 2] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    fused = room.fuse("--set", "cameras.front.mask=%s" % (tmp_path / "mask.png"), name="ego.bag")
+    for message in fused.of("/points_semantic"):
+        cloud = read_cloud(message)
+        t_ref = message.header.stamp.to_nsec()  # the stamp of the front image
+        uv, inside = pixels_in(room.drive, camera, world_points(room.drive, cloud, t_ref), t_ref)
+        masked = inside & (uv[:, 0] < camera.width / 2 - 1)
+        free = inside & (uv[:, 0] > camera.width / 2)
+        assert (cloud["cameras"][masked] & 1 == 0).all()
+        assert (cloud["cameras"][free] & 1 == 1).mean() > 0.9
+        assert (cloud["status"][masked & (cloud["cameras"] == 0)] != 0).all()
+    result = room.fuse("--set", "cameras.front.mask=%s" % (tmp_path / "no.png"), expect=1)
+    assert "no.png" in result.stderr
+
+
+def shared(relative):
+    """A file of the optional data; the test is skipped without it."""
+    folder = os.environ.get("SLF_SHARED_DIR")
+    if not folder:
+        here = os.path.dirname(os.path.abspath(__file__))
+        folder = os.path.join(here, "..", "..", "..", "shared")
+    path = os.path.join(folder, relative)
+    if not os.path.exists(path):
+        pytest.skip("optional data not found: " + relative)
+    return path
+
+
+def test_own_network_where_the_bag_has_no_scores(tmp_path):
+    source = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "config")
+    network = shared("models/enet_camvid12_480x360.onnx")
+    with open(os.path.join(source, "models", "enet_camvid12.yaml")) as file:
+        text = file.read().replace("file: enet_camvid12_480x360.onnx", "file: " + network)
+    assert network in text
+    (tmp_path / "enet.yaml").write_text(text)
+    made = Made(tmp_path, Drive(scans=2, semantics="none"))
+    rig = made.rig.read_text()
+    classes = os.path.abspath(os.path.join(source, "classes_camvid12.yaml"))
+    begin, end = rig.index("classes:"), rig.index("cameras:")
+    made.rig.write_text(
+        rig[:begin]
+        + "classes: {file: %s}\n" % classes
+        + rig[end:]
+        + "segmentation: {model: enet.yaml}\n"
+    )
+    fused = made.fuse("--all")
+    again = made.fuse("--all", name="again.bag")
+    assert digest(fused.path) == digest(again.path)
+    for camera in made.drive.cameras:
+        chosen = [m.time_ref.to_nsec() for m in fused.of("/%s/selection" % camera.name)]
+        scores = fused.of("/%s/scores" % camera.name)
+        assert [m.header.stamp.to_nsec() for m in scores] == sorted(set(chosen))
+        assert {m.encoding for m in scores} == {"32FC12"}
+        assert {(m.width, m.height) for m in fused.of("/%s/share" % camera.name)} == {
+            (m.width, m.height) for m in scores
+        }
+    for cloud in fused.clouds():
+        assert (cloud["status"] == 0).any()
+
+
+def test_real_packets_against_another_decoder(tmp_path):
+    from scipy.spatial import cKDTree
+
+    capture = np.load(shared("data/vlp16_packets/nebula_vlp16_scans.npz"))
+    expected_path = shared("data/vlp16_packets/nebula_vlp16_expected_1673400472138016708.pcd")
+    types = bag_factory.velodyne_types()
+    with rosbag.Bag(str(tmp_path / "in.bag"), "w") as bag:
+        for index, scan_stamp in enumerate(capture["scan_stamp"]):
+            scan = types["velodyne_msgs/VelodyneScan"]()
+            scan.header.frame_id = "velodyne"
+            scan.header.stamp = bag_factory.stamp(int(scan_stamp * 1e9))
+            for number in np.flatnonzero(capture["scan"] == index):
+                packet = types["velodyne_msgs/VelodynePacket"]()
+                packet.stamp = bag_factory.stamp(int(capture["packet_stamp"][number] * 1e9))
+                packet.data = capture["packets"][number].tobytes()
+                scan.packets.append(packet)
+            bag.write("/velodyne_packets", scan, scan.header.stamp)
+    (tmp_path / "rig.yaml").write_text("lidar: {input: packets}\nmotion: {enabled: false}\n")
+    result = run(tmp_path / "in.bag", tmp_path / "out.bag", "--rig", tmp_path / "rig.yaml")
+    assert result.returncode == 0, result.stderr
+    clouds = Fused(tmp_path / "out.bag", result).clouds("/points_compensated")
+    assert len(clouds) == len(capture["scan_stamp"])
+    with open(expected_path, "rb") as file:
+        data = file.read()
+    at = data.index(b"DATA binary\n") + len(b"DATA binary\n")
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rest", "V20")]
+    size = int(data[data.index(b"POINTS ") :].split()[1])
+    expected = np.frombuffer(data, np.dtype(kinds), size, at)
+    expected = np.stack([expected[axis] for axis in "xyz"], axis=-1)
+    medians = []
+    for cloud in clouds:
+        ours = np.stack([cloud[axis] for axis in "xyz"], axis=-1)
+        medians.append(np.median(cKDTree(ours).query(expected)[0]))
+    # One of the scans is the other decoder's: coordinates agree to the range unit of 2 mm.
+    assert min(medians) < 2e-3, medians
+
+
 # -- what can go wrong
 
 
