@@ -51,7 +51,7 @@ FusionConfig fusionConfig(const Rig& rig) {
   return config;
 }
 
-FusionChain::FusionChain(const Rig& rig) : rig_(rig) {
+FusionChain::FusionChain(const Rig& rig, bool with_network) : rig_(rig) {
   std::vector<std::string> problems;
   for (const CameraConfig& config : rig_.cameras) {
     Camera camera{
@@ -66,7 +66,7 @@ FusionChain::FusionChain(const Rig& rig) : rig_(rig) {
     cameras_.push_back(std::move(camera));
   }
   if (!problems.empty()) throw ConfigError(problems);
-  if (!rig_.segmentation.model.empty()) {
+  if (with_network && !rig_.segmentation.model.empty()) {
     model_ = std::make_unique<SegmentationModel>(rig_.segmentation.model, rig_.classes);
   }
   if (rig_.classes.size() > 0) {

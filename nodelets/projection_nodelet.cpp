@@ -51,7 +51,7 @@ class ProjectionNodelet : public FusionNodelet {
   };
 
   void initialize() override {
-    chain_ = std::make_unique<FusionChain>(rig());
+    chain_ = std::make_unique<FusionChain>(rig(), /*with_network=*/false);
 
     FusionQueueConfig queue;
     for (const CameraConfig& camera : rig().cameras)
