@@ -88,7 +88,9 @@ def test_packet_capture_becomes_compensated_clouds(optional_data, tmp_path):
         "motion: {enabled: false}\n"
     )
     fuse(bag, tmp_path / "out.bag", rig)
-    clouds = [to_array(message) for message in messages(tmp_path / "out.bag", "/points_compensated")]
+    clouds = [
+        to_array(message) for message in messages(tmp_path / "out.bag", "/points_compensated")
+    ]
     assert len(clouds) == 4
     for cloud in clouds:
         assert len(cloud) > 10000
