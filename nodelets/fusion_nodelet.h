@@ -38,7 +38,7 @@ class FusionNodelet : public nodelet::Nodelet {
   virtual void updateSubscriptions() {}
   /// A clock jump was seen: forget buffered data.
   virtual void startEpoch(const std::string& /*why*/) {}
-  /// What is missing, in words, when nothing was published for a while; empty = nothing to say.
+  /// Why nothing has to be published (nobody listens), in words; empty = something should be.
   virtual std::string explainSilence() { return {}; }
   /// Called every `kTickPeriod` with now(), one at a time with the callbacks of getNodeHandle().
   virtual void tick(StampNs /*now_ns*/) {}
@@ -49,7 +49,9 @@ class FusionNodelet : public nodelet::Nodelet {
   Health& health() { return health_; }
   std::mutex& connectMutex() { return connect_mutex_; }
 
-  /// The clock of deadlines: ROS time in simulation, else steady time.
+  /// The clock of deadlines: ROS time in simulation, else steady time. A simulated clock that
+  /// stands still goes on with wall time after 3 s, so that the last scans of a bag, which wait
+  /// for what it does not hold, come out.
   StampNs now() const;
 
   /// Runs `work`; no exception leaves. Errors are counted, reported (throttled) and shown.
@@ -66,11 +68,11 @@ class FusionNodelet : public nodelet::Nodelet {
                         });
   }
   template <class M>
-  ros::Subscriber subscribe(
-      ros::NodeHandle& handle, const std::string& topic, int queue_size,
-      const std::function<void(const boost::shared_ptr<const M>&)>& callback) {
+  ros::Subscriber subscribe(ros::NodeHandle& handle, const std::string& topic, int queue_size,
+                            const std::function<void(const boost::shared_ptr<const M>&)>& callback,
+                            Health::Expect expect = Health::Expect::kStream) {
     const std::string resolved = handle.resolveName(topic);
-    health_.expectInput(resolved);
+    health_.expectInput(resolved, expect);
     const boost::function<void(const boost::shared_ptr<const M>&)> guarded =
         [this, resolved, callback](const boost::shared_ptr<const M>& message) {
           health_.received(resolved);
@@ -78,6 +80,13 @@ class FusionNodelet : public nodelet::Nodelet {
         };
     return handle.subscribe<M>(topic, static_cast<uint32_t>(queue_size), guarded,
                                ros::VoidConstPtr(), ros::TransportHints().tcpNoDelay());
+  }
+
+  /// Ends a subscription, if it is one; what it waited for is no longer missed.
+  void unsubscribe(ros::Subscriber* subscriber) {
+    if (!*subscriber) return;
+    health_.retireInput(subscriber->getTopic());
+    subscriber->shutdown();
   }
 
   /// Advertises a topic whose first listener and last farewell call updateSubscriptions.
@@ -112,6 +121,9 @@ class FusionNodelet : public nodelet::Nodelet {
   Health health_;
   std::mutex connect_mutex_;
   bool initialized_ = false;  ///< guarded by connect_mutex_
+  mutable std::mutex clock_mutex_;
+  mutable StampNs clock_ns_ = 0;          ///< last simulated time, and
+  mutable StampNs clock_changed_ns_ = 0;  ///< when it came; both guarded by clock_mutex_
   std::mutex report_mutex_;
   std::map<std::string, Health::Clock::time_point> reported_;
   Health::Clock::time_point started_ = Health::Clock::now();

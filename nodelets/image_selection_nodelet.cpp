@@ -73,11 +73,11 @@ class ImageSelectionNodelet : public FusionNodelet {
     }
     if (wanted == static_cast<bool>(lidar_subscriber_)) return;
     if (!wanted) {
-      lidar_subscriber_.shutdown();
+      unsubscribe(&lidar_subscriber_);
       for (const auto& camera : cameras_) {
-        camera->images_subscriber.shutdown();
-        camera->semantics_subscriber.shutdown();
-        camera->info_subscriber.shutdown();
+        unsubscribe(&camera->images_subscriber);
+        unsubscribe(&camera->semantics_subscriber);
+        unsubscribe(&camera->info_subscriber);
       }
       return;
     }
@@ -114,9 +114,8 @@ class ImageSelectionNodelet : public FusionNodelet {
     if (sweep_) {
       camera.info_subscriber = subscribe<sensor_msgs::CameraInfo>(
           getNodeHandle(), inputTopic(config, config.camera_info), 8,
-          [&camera](const sensor_msgs::CameraInfoConstPtr& info) {
-            camera.geometry.update(*info);
-          });
+          [&camera](const sensor_msgs::CameraInfoConstPtr& info) { camera.geometry.update(*info); },
+          Health::Expect::kOnce);
     }
   }
 
@@ -142,7 +141,9 @@ class ImageSelectionNodelet : public FusionNodelet {
     const StampNs stamp = stampNs(scores.header.stamp);
     if (scores.data.empty() || !usable(semanticsTopic(rig(), camera.config), stamp)) return;
     camera.semantics.put(stamp, true);
-    if (camera.images.find(stamp) != nullptr) {
+    // Nothing is clustered for a camera that brings probabilities: it needs no image.
+    if (camera.config.input == CameraInput::kProbabilities ||
+        camera.images.find(stamp) != nullptr) {
       selector_->addImage(index, stamp);
       decide();
     }
@@ -154,8 +155,9 @@ class ImageSelectionNodelet : public FusionNodelet {
     for (const auto& [stamp, image] : camera->images.values()) bytes += image.bytes();
     while (bytes > kMaxImageBytes && camera->images.size() > 1) {
       const auto oldest = camera->images.values().begin();
+      const StampNs stamp = oldest->first;
       bytes -= oldest->second.bytes();
-      camera->images.erase(oldest->first);
+      camera->images.erase(stamp);
     }
   }
 
@@ -226,7 +228,7 @@ class ImageSelectionNodelet : public FusionNodelet {
     const SelectorDecisions decisions = selector_->advance(now());
     for (const ReferenceDecision& decision : decisions.references) {
       if (decision.timed_out) {
-        health().count("t_ref is the middle of the scan: no reference image in time");
+        health().problem("t_ref is the middle of the scan: no reference image in time");
       }
       publish(reference_, boost::make_shared<sensor_msgs::TimeReference>(
                               scanReferenceMessage(decision.scan_ns, decision.reference_ns)));
@@ -246,7 +248,8 @@ class ImageSelectionNodelet : public FusionNodelet {
     Camera& camera = *cameras_[static_cast<std::size_t>(decision.camera)];
     const std::string& name = camera.config.name;
     if (!decision.image_stamp) {
-      health().count(name + (decision.timed_out ? ": no image, timed out" : ": no image in time"));
+      health().problem(name +
+                       (decision.timed_out ? ": no image, timed out" : ": no image in time"));
     }
     publish(camera.selection, boost::make_shared<sensor_msgs::TimeReference>(
                                   selectionMessage(decision.scan_ns, decision.image_stamp, name)));
@@ -255,6 +258,7 @@ class ImageSelectionNodelet : public FusionNodelet {
       return;
     }
     const Image* image = camera.images.find(*decision.image_stamp);
+    if (image == nullptr && camera.config.input == CameraInput::kProbabilities) return;
     if (image == nullptr) {
       health().count("dropped: " + name + " image left the buffer before it was chosen");
       return;

@@ -59,7 +59,7 @@ class SegmentationNodelet : public FusionNodelet {
             getNodeHandle(), cameraTopic(rig().cameras[i], "image_selected"), 4,
             [this, i](const sensor_msgs::ImageConstPtr& image) { onImage(i, image); });
       } else if (!wanted && camera.subscriber) {
-        camera.subscriber.shutdown();
+        unsubscribe(&camera.subscriber);
       }
     }
   }
