@@ -107,6 +107,13 @@ class Router {
         addByStamp(m, name + " images", &track->images, drops_);
       });
     } else if (camera.input != CameraInput::kProbabilities) {
+      const bool raw = camera.transport == ImageTransport::kRaw;
+      CameraConfig other = camera;
+      other.transport = raw ? ImageTransport::kCompressed : ImageTransport::kRaw;
+      if (input_.find(imageTopic(other))) {
+        problem += "; there is " + imageTopic(other) +
+                   ": is transport: " + (raw ? "compressed" : "raw") + " meant?";
+      }
       DropLog::warn(problem);
     }
 

@@ -73,9 +73,9 @@ class Camera:
     position: Tuple[float, float, float]
     phase_ns: int = 0  # of its stamps against START_NS
     period_ns: int = 50_000_000
-    width: int = 320
-    height: int = 240
-    focal: float = 110.0
+    width: int = 240
+    height: int = 180
+    focal: float = 82.0
     score_step: int = 2  # image pixels per score cell
     clock_ahead_ns: int = 0  # its stamps are later than the truth by this
 

@@ -177,6 +177,19 @@ def test_compressed_images_and_bag_give_the_same_as_raw(tmp_path, fused):
         assert ours.data == theirs.data
 
 
+def test_wrong_transport_is_told(room, tmp_path):
+    result = run(
+        room.bag,
+        tmp_path / "out.bag",
+        "--rig",
+        room.rig,
+        "--set",
+        "cameras.front.transport=compressed",
+    )
+    assert result.returncode == 0
+    assert "transport: raw" in result.stderr
+
+
 def test_odometry_topic_gives_the_same_as_tf(tmp_path, fused):
     made = Made(tmp_path, Drive(odometry="topic"))
     for ours, theirs in zip(made.fuse().clouds(), fused.clouds()):
