@@ -60,9 +60,12 @@ std::string describeSilentTopic(const std::string& topic, const ros::master::V_T
 
 }  // namespace
 
-FusionNodelet::~FusionNodelet() {
+FusionNodelet::~FusionNodelet() { stop(); }
+
+void FusionNodelet::stop() {
   diagnostics_timer_.stop();
   tick_timer_.stop();
+  gate_->close();
 }
 
 void FusionNodelet::onInit() {
@@ -83,8 +86,9 @@ void FusionNodelet::onInit() {
     }
     // Wall time: ROS timers stand still while /clock is silent, which is one thing to report.
     diagnostics_timer_ = getMTNodeHandle().createWallTimer(
-        kDiagnosticsPeriod,
-        [this](const ros::WallTimerEvent&) { guard("watchdog", [this] { watch(); }); });
+        kDiagnosticsPeriod, [this, gate = gate_](const ros::WallTimerEvent&) {
+          gate->pass([this] { guard("watchdog", [this] { watch(); }); });
+        });
   } catch (const ConfigError& problem) {
     NODELET_FATAL_STREAM(problem.what());
   } catch (const std::exception& problem) {
@@ -94,7 +98,9 @@ void FusionNodelet::onInit() {
 
 void FusionNodelet::startTicking() {
   tick_timer_ = getNodeHandle().createWallTimer(
-      kTickPeriod, [this](const ros::WallTimerEvent&) { guard("tick", [this] { tick(now()); }); });
+      kTickPeriod, [this, gate = gate_](const ros::WallTimerEvent&) {
+        gate->pass([this] { guard("tick", [this] { tick(now()); }); });
+      });
 }
 
 StampNs FusionNodelet::now() const {

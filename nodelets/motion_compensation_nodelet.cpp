@@ -31,6 +31,9 @@ constexpr StampNs kReferenceGraceNs = 500000000;
 }  // namespace
 
 class MotionCompensationNodelet : public FusionNodelet {
+ public:
+  ~MotionCompensationNodelet() override { stop(); }
+
  private:
   struct Scan {
     TimedCloud cloud;

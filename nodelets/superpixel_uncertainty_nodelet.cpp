@@ -33,6 +33,9 @@ constexpr std::size_t kWaitingScores = 24;
 }  // namespace
 
 class SuperpixelUncertaintyNodelet : public FusionNodelet {
+ public:
+  ~SuperpixelUncertaintyNodelet() override { stop(); }
+
  private:
   struct Camera {
     explicit Camera(const Rig& rig, const CameraConfig& config)
