@@ -71,7 +71,7 @@ def draw_reliability(path: str, curves: Sequence[Tuple[str, Reliability]]) -> No
         sharex=True,
         sharey="row",
         squeeze=False,
-        gridspec_kw={"height_ratios": [3, 1], "hspace": 0.08, "wspace": 0.08},
+        gridspec_kw={"height_ratios": [3, 1], "hspace": 0.12, "wspace": 0.14},
     )
     for column, (name, reliability) in enumerate(curves):
         top, bottom = axes[0, column], axes[1, column]
@@ -112,6 +112,9 @@ def draw_reliability(path: str, curves: Sequence[Tuple[str, Reliability]]) -> No
         )
         bottom.set(xlim=(0, 1), ylim=(0, 1), xlabel="confidence")
         bottom.set_xticks([0, 0.5, 1])
+        bottom.set_xticklabels(["0", "0.5", "1"])
+        bottom.set_yticks([0, 1])
+        bottom.set_yticklabels(["0", "1"])
         for axis in (top, bottom):
             axis.spines["top"].set_visible(False)
             axis.spines["right"].set_visible(False)
