@@ -163,7 +163,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
                const ImageSize& map_size) {
     const StageTimer timer(health(), "superpixels");
     camera->maps.put(stamp, std::make_shared<const SuperpixelMap>(
-                                camera->semantics.cluster(colorImage(image), map_size)));
+                                camera->semantics.cluster(colorImage(image), map_size, stamp)));
   }
 
   using Outputs = std::vector<std::pair<const ros::Publisher*, sensor_msgs::ImagePtr>>;
