@@ -63,16 +63,24 @@ BagFusion::BagFusion(const FuseBagOptions& options, void (*checkpoint)())
 
 void BagFusion::run() {
   BagOutput output(options_.output, options_.force);
+  try {
+    fuseInto(&output);
+  } catch (const rosbag::BagException& e) {
+    throw Error(bagErrorText(options_.input, e));
+  }
+  output.commit();
+}
+
+void BagFusion::fuseInto(BagOutput* output) {
   index_ = indexDrive(input_, rig_, &poses_, &drops_, !options_.quiet, checkpoint_);
   measureScans();
   select();
-  fuseScans(&output);
-  if (options_.tf) copyTransforms(&output);
+  fuseScans(output);
+  if (options_.tf) copyTransforms(output);
   if (scans_written_ == 0) {
     throw Error(options_.input + ": none of its " + count(index_.scans.size(), "scan") +
                 " can be used");
   }
-  output.commit();
 }
 
 TimedCloud BagFusion::decode(const rosbag::MessageInstance& message) {
@@ -238,6 +246,8 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
     }
   }
   const FusionResult result = chain_.fused(rigid.cloud, views);
+  const auto compensated = compensatedCloudMessage(rigid.cloud);
+  const auto semantic = semanticCloudMessage(result.cloud, rig_.classes);
 
   if (scans_written_ == 0) {
     output->writeLatched("/class_info", rigid.cloud.stamp, classInfoMessage(rig_.classes));
@@ -247,9 +257,8 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
     output->write(cameraOutput(c, "selection"), scan_ns,
                   selectionMessage(scan_ns, scan.image_stamps[c], rig_.cameras[c].name));
   }
-  output->write("/points_compensated", rigid.cloud.stamp, *compensatedCloudMessage(rigid.cloud));
-  output->write("/points_semantic", rigid.cloud.stamp,
-                *semanticCloudMessage(result.cloud, rig_.classes));
+  output->write("/points_compensated", rigid.cloud.stamp, *compensated);
+  output->write("/points_semantic", rigid.cloud.stamp, *semantic);
   if (options_.all) writeOverlays(result, images, views, rigid.cloud.stamp, output);
 
   points_.decoded += raw.size();
@@ -448,7 +457,7 @@ std::string BagFusion::summary() const {
   }
   if (drops_.counts().empty()) text += "  nothing was dropped\n";
   for (const auto& drop : drops_.counts()) {
-    text += "  dropped: " + drop.first + ": " + std::to_string(drop.second) + "\n";
+    text += "  counted: " + drop.first + ": " + std::to_string(drop.second) + "\n";
   }
   const double seconds =
       std::chrono::duration<double>(std::chrono::steady_clock::now() - started_).count();

@@ -57,6 +57,7 @@ class BagFusion {
     std::array<std::uint64_t, 5> by_status{};
   };
 
+  void fuseInto(BagOutput* output);
   void measureScans();
   void select();
   void fuseScans(BagOutput* output);

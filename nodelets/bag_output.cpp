@@ -28,19 +28,29 @@ BagOutput::BagOutput(const std::string& path, bool overwrite)
 
 BagOutput::~BagOutput() {
   if (committed_) return;
-  if (bag_) {
-    try {
-      bag_->close();
-    } catch (const std::exception&) {
-      // The destructor of an open bag writes again, and an exception there ends the program.
-      bag_.release();
-    }
+  try {
+    close();
+  } catch (const std::exception&) {
+    // Of no interest: the file goes.
   }
   ::unlink(written_path_.c_str());
 }
 
+/// Closes the bag once. One that cannot be closed is left alone: its destructor would write to it
+/// again, and an exception there ends the program.
+void BagOutput::close() {
+  if (!bag_) return;
+  try {
+    bag_->close();
+    bag_.reset();
+  } catch (const std::exception& e) {
+    bag_.release();
+    fail(e.what());
+  }
+}
+
 void BagOutput::commit() {
-  guarded([&] { bag_->close(); });
+  close();
   const int file = ::open(written_path_.c_str(), O_RDONLY | O_CLOEXEC);
   const bool flushed = file >= 0 && ::fsync(file) == 0;
   const std::string flush_error = flushed ? "" : std::strerror(errno);

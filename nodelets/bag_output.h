@@ -60,6 +60,7 @@ class BagOutput {
       fail(e.what());
     }
   }
+  void close();
   [[noreturn]] void fail(const std::string& why);
 
   std::string path_;

@@ -445,7 +445,8 @@ sensor_msgs::PointCloud2Ptr semanticCloudMessage(const SemanticCloud& cloud,
     put(cloud.entropy[i], entropy, point);
     put(cloud.cameras[i], cameras, point);
     put(cloud.points.status[i], status, point);
-    std::memcpy(point + first_class, &cloud.probabilities[i * class_count],
+    if (class_count == 0) continue;
+    std::memcpy(point + first_class, cloud.probabilities.data() + i * class_count,
                 class_count * sizeof(float));
   }
   return message;

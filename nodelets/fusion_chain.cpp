@@ -21,6 +21,24 @@ std::string sizeText(const cv::Mat& image) {
   return std::to_string(image.cols) + "x" + std::to_string(image.rows);
 }
 
+/// The cloud of a rig without classes, where no point can have one.
+FusionResult unclassified(const Cloud& cloud, bool keep_unlabelled) {
+  FusionResult result;
+  SemanticCloud& points = result.cloud;
+  points.points = cloud;
+  if (!keep_unlabelled) points.points.resize(0);
+  for (std::uint8_t& status : points.points.status) {
+    if (status != static_cast<std::uint8_t>(PointStatus::kNoOdometry)) {
+      status = static_cast<std::uint8_t>(PointStatus::kOutsideImages);
+    }
+  }
+  points.label.assign(points.size(), kNoLabel);
+  points.confidence.assign(points.size(), 0.0f);
+  points.entropy.assign(points.size(), 1.0f);
+  points.cameras.assign(points.size(), 0);
+  return result;
+}
+
 }  // namespace
 
 FusionConfig fusionConfig(const Rig& rig) {
@@ -33,7 +51,7 @@ FusionConfig fusionConfig(const Rig& rig) {
   return config;
 }
 
-FusionChain::FusionChain(const Rig& rig) : rig_(rig) {
+FusionChain::FusionChain(const Rig& rig, bool with_network) : rig_(rig) {
   std::vector<std::string> problems;
   for (const CameraConfig& config : rig_.cameras) {
     Camera camera{
@@ -48,10 +66,12 @@ FusionChain::FusionChain(const Rig& rig) : rig_(rig) {
     cameras_.push_back(std::move(camera));
   }
   if (!problems.empty()) throw ConfigError(problems);
-  if (!rig_.segmentation.model.empty()) {
+  if (with_network && !rig_.segmentation.model.empty()) {
     model_ = std::make_unique<SegmentationModel>(rig_.segmentation.model, rig_.classes);
   }
-  projector_ = std::make_unique<SemanticProjector>(fusionConfig(rig_));
+  if (rig_.classes.size() > 0) {
+    projector_ = std::make_unique<SemanticProjector>(fusionConfig(rig_));
+  }
 }
 
 FusionChain::~FusionChain() = default;
@@ -129,6 +149,7 @@ CameraView FusionChain::view(std::size_t index, const CameraPlace& place,
 }
 
 FusionResult FusionChain::fused(const Cloud& cloud, std::vector<CameraView> views) const {
+  if (!projector_) return unclassified(cloud, rig_.keep_unlabelled);
   return projector_->fuse(cloud, std::move(views));
 }
 

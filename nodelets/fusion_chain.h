@@ -43,8 +43,8 @@ struct CameraPlace {
 
 class FusionChain {
  public:
-  /// Loads masks and the network. Throws ConfigError.
-  explicit FusionChain(const Rig& rig);
+  /// Loads the masks and, unless `with_network` is false, the rig's network. Throws ConfigError.
+  explicit FusionChain(const Rig& rig, bool with_network = true);
   ~FusionChain();
 
   /// Superpixels and share of an image of camera `camera`, whose `image` and `input` are given
@@ -75,7 +75,7 @@ class FusionChain {
   Rig rig_;
   std::vector<Camera> cameras_;
   std::unique_ptr<SegmentationModel> model_;
-  std::unique_ptr<SemanticProjector> projector_;
+  std::unique_ptr<SemanticProjector> projector_;  ///< null for a rig without classes
 };
 
 FusionConfig fusionConfig(const Rig& rig);

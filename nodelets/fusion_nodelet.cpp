@@ -18,6 +18,8 @@ const ros::WallDuration kDiagnosticsPeriod(1.0);
 constexpr std::chrono::seconds kReportPeriod{30};
 /// Silence after which the watchdog speaks.
 constexpr std::chrono::seconds kSilence{5};
+/// A clock that stands still for longer is taken for the end of a bag.
+constexpr StampNs kClockStall = 3 * kNsPerSecond;
 
 /// Number of single-letter edits that make b of a (Levenshtein).
 std::size_t editDistance(const std::string& a, const std::string& b) {
@@ -37,11 +39,16 @@ std::size_t editDistance(const std::string& a, const std::string& b) {
 
 std::string lastName(const std::string& topic) { return topic.substr(topic.rfind('/') + 1); }
 
-/// "no message on /a/b (1 publisher)", or with the advertised topics that look like it.
+bool isAdvertised(const std::string& topic, const ros::master::V_TopicInfo& topics) {
+  return std::any_of(topics.begin(), topics.end(),
+                     [&](const auto& info) { return info.name == topic; });
+}
+
+/// "no message on /a/b, which is advertised", or with the advertised topics that look like it.
 std::string describeSilentTopic(const std::string& topic, const ros::master::V_TopicInfo& topics) {
+  if (isAdvertised(topic, topics)) return "no message on " + topic + ", which is advertised";
   std::string similar;
   for (const auto& info : topics) {
-    if (info.name == topic) return "no message on " + topic + ", which is advertised";
     if (lastName(info.name) == lastName(topic) ||
         editDistance(info.name, topic) <= std::max<std::size_t>(2, topic.size() / 5)) {
       similar += (similar.empty() ? "" : ", ") + info.name;
@@ -53,9 +60,12 @@ std::string describeSilentTopic(const std::string& topic, const ros::master::V_T
 
 }  // namespace
 
-FusionNodelet::~FusionNodelet() {
+FusionNodelet::~FusionNodelet() { stop(); }
+
+void FusionNodelet::stop() {
   diagnostics_timer_.stop();
   tick_timer_.stop();
+  gate_->close();
 }
 
 void FusionNodelet::onInit() {
@@ -76,8 +86,9 @@ void FusionNodelet::onInit() {
     }
     // Wall time: ROS timers stand still while /clock is silent, which is one thing to report.
     diagnostics_timer_ = getMTNodeHandle().createWallTimer(
-        kDiagnosticsPeriod,
-        [this](const ros::WallTimerEvent&) { guard("watchdog", [this] { watch(); }); });
+        kDiagnosticsPeriod, [this, gate = gate_](const ros::WallTimerEvent&) {
+          gate->pass([this] { guard("watchdog", [this] { watch(); }); });
+        });
   } catch (const ConfigError& problem) {
     NODELET_FATAL_STREAM(problem.what());
   } catch (const std::exception& problem) {
@@ -87,12 +98,21 @@ void FusionNodelet::onInit() {
 
 void FusionNodelet::startTicking() {
   tick_timer_ = getNodeHandle().createWallTimer(
-      kTickPeriod, [this](const ros::WallTimerEvent&) { guard("tick", [this] { tick(now()); }); });
+      kTickPeriod, [this, gate = gate_](const ros::WallTimerEvent&) {
+        gate->pass([this] { guard("tick", [this] { tick(now()); }); });
+      });
 }
 
 StampNs FusionNodelet::now() const {
-  if (ros::Time::isSimTime()) return static_cast<StampNs>(ros::Time::now().toNSec());
-  return static_cast<StampNs>(ros::SteadyTime::now().toNSec());
+  const auto steady_ns = static_cast<StampNs>(ros::SteadyTime::now().toNSec());
+  if (!ros::Time::isSimTime()) return steady_ns;
+  const auto clock_ns = static_cast<StampNs>(ros::Time::now().toNSec());
+  std::lock_guard<std::mutex> lock(clock_mutex_);
+  if (clock_ns != clock_ns_) {
+    clock_ns_ = clock_ns;
+    clock_changed_ns_ = steady_ns;
+  }
+  return clock_ns + std::max<StampNs>(0, steady_ns - clock_changed_ns_ - kClockStall);
 }
 
 void FusionNodelet::guard(const std::string& where, const std::function<void()>& work) {
@@ -128,26 +148,31 @@ void FusionNodelet::error(const std::string& key, const std::string& text) {
 void FusionNodelet::watch() {
   diagnostics_->force_update();
   const auto now = Health::Clock::now();
-  if (now - started_ < kSilence || now - watched_ < kSilence || health_.publishedWithin(kSilence)) {
-    return;
-  }
+  if (now - started_ < kSilence || now - watched_ < kSilence) return;
   watched_ = now;
-  if (ros::Time::isSimTime() && ros::Time::now().isZero()) {
+  const bool is_silent = !health_.publishedWithin(kSilence);
+  if (is_silent && ros::Time::isSimTime() && ros::Time::now().isZero()) {
     warn("clock", "use_sim_time is true but /clock is silent; play with --clock");
     return;
   }
-  const std::vector<std::string> silent = health_.silentInputs(kSilence);
-  std::string reasons;
-  if (!silent.empty()) {
-    ros::master::V_TopicInfo topics;
-    ros::master::getTopics(topics);
-    for (const auto& topic : silent) {
-      reasons += (reasons.empty() ? "" : "; ") + describeSilentTopic(topic, topics);
-    }
+  const std::string idle = explainSilence();
+  if (is_silent && !idle.empty()) {
+    warn("idle", "nothing published for 5 s: " + idle);
+    return;
   }
-  const std::string explanation = explainSilence();
-  if (!explanation.empty()) reasons += (reasons.empty() ? "" : "; ") + explanation;
-  if (!reasons.empty()) warn("silence", "nothing published for 5 s: " + reasons);
+  const std::vector<std::string> silent = health_.silentInputs(kSilence);
+  if (silent.empty()) return;
+  ros::master::V_TopicInfo topics;
+  ros::master::getTopics(topics);
+  std::string reasons;
+  for (const auto& topic : silent) {
+    // While something is published, only what nobody advertises is worth a line: a camera that is
+    // merely late is counted where it is missed.
+    if (!is_silent && isAdvertised(topic, topics)) continue;
+    reasons += (reasons.empty() ? "" : "; ") + describeSilentTopic(topic, topics);
+  }
+  if (reasons.empty()) return;
+  warn("silence " + reasons, std::string(is_silent ? "nothing published for 5 s: " : "") + reasons);
 }
 
 }  // namespace semantic_lidar_fusion

@@ -12,7 +12,7 @@
 #include <nodelet/nodelet.h>
 #include <ros/ros.h>
 
-#include <atomic>
+#include <condition_variable>
 #include <exception>
 #include <functional>
 #include <map>
@@ -25,6 +25,36 @@
 
 namespace semantic_lidar_fusion {
 
+/// Lets callbacks in until it is closed. Unloading disables a nodelet's queues, but does not wait
+/// for a callback that runs on another thread.
+class CallbackGate {
+ public:
+  /// Runs `work`, unless the gate is closed.
+  template <class Work>
+  void pass(const Work& work) {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      if (closed_) return;
+      ++inside_;
+    }
+    work();  // does not throw: guarded
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (--inside_ == 0) empty_.notify_all();
+  }
+  /// Returns when nothing is inside any more.
+  void close() {
+    std::unique_lock<std::mutex> lock(mutex_);
+    closed_ = true;
+    empty_.wait(lock, [this] { return inside_ == 0; });
+  }
+
+ private:
+  std::mutex mutex_;
+  std::condition_variable empty_;
+  int inside_ = 0;
+  bool closed_ = false;
+};
+
 class FusionNodelet : public nodelet::Nodelet {
  public:
   ~FusionNodelet() override;
@@ -36,12 +66,13 @@ class FusionNodelet : public nodelet::Nodelet {
   /// Demand has changed: subscribe on the first listener, shut down on the last. Called with
   /// `connectMutex` held.
   virtual void updateSubscriptions() {}
-  /// A clock jump was seen: forget buffered data.
-  virtual void startEpoch(const std::string& /*why*/) {}
-  /// What is missing, in words, when nothing was published for a while; empty = nothing to say.
+  /// Why nothing has to be published (nobody listens), in words; empty = something should be.
   virtual std::string explainSilence() { return {}; }
   /// Called every `kTickPeriod` with now(), one at a time with the callbacks of getNodeHandle().
   virtual void tick(StampNs /*now_ns*/) {}
+  /// Ends all callbacks and waits for those that run. Every destructor of a derived class calls it
+  /// first: its members are gone when this class's destructor runs.
+  void stop();
   /// Asks for `tick`; call in initialize.
   void startTicking();
 
@@ -49,7 +80,9 @@ class FusionNodelet : public nodelet::Nodelet {
   Health& health() { return health_; }
   std::mutex& connectMutex() { return connect_mutex_; }
 
-  /// The clock of deadlines: ROS time in simulation, else steady time.
+  /// The clock of deadlines: ROS time in simulation, else steady time. A simulated clock that
+  /// stands still goes on with wall time after 3 s, so that the last scans of a bag, which wait
+  /// for what it does not hold, come out.
   StampNs now() const;
 
   /// Runs `work`; no exception leaves. Errors are counted, reported (throttled) and shown.
@@ -66,29 +99,41 @@ class FusionNodelet : public nodelet::Nodelet {
                         });
   }
   template <class M>
-  ros::Subscriber subscribe(
-      ros::NodeHandle& handle, const std::string& topic, int queue_size,
-      const std::function<void(const boost::shared_ptr<const M>&)>& callback) {
+  ros::Subscriber subscribe(ros::NodeHandle& handle, const std::string& topic, int queue_size,
+                            const std::function<void(const boost::shared_ptr<const M>&)>& callback,
+                            Health::Expect expect = Health::Expect::kStream) {
     const std::string resolved = handle.resolveName(topic);
-    health_.expectInput(resolved);
+    health_.expectInput(resolved, expect);
     const boost::function<void(const boost::shared_ptr<const M>&)> guarded =
-        [this, resolved, callback](const boost::shared_ptr<const M>& message) {
-          health_.received(resolved);
-          guard(resolved, [&] { callback(message); });
+        [this, gate = gate_, resolved, callback](const boost::shared_ptr<const M>& message) {
+          gate->pass([&] {
+            health_.received(resolved);
+            guard(resolved, [&] { callback(message); });
+          });
         };
     return handle.subscribe<M>(topic, static_cast<uint32_t>(queue_size), guarded,
                                ros::VoidConstPtr(), ros::TransportHints().tcpNoDelay());
   }
 
+  /// Ends a subscription, if it is one; what it waited for is no longer missed.
+  void unsubscribe(ros::Subscriber* subscriber) {
+    if (!*subscriber) return;
+    health_.retireInput(subscriber->getTopic());
+    subscriber->shutdown();
+  }
+
   /// Advertises a topic whose first listener and last farewell call updateSubscriptions.
   template <class M>
   ros::Publisher advertise(ros::NodeHandle& handle, const std::string& topic, int queue_size) {
-    const ros::SubscriberStatusCallback changed = [this](const ros::SingleSubscriberPublisher&) {
-      guard("connection", [this] {
-        std::lock_guard<std::mutex> lock(connect_mutex_);
-        if (initialized_) updateSubscriptions();
-      });
-    };
+    const ros::SubscriberStatusCallback changed =
+        [this, gate = gate_](const ros::SingleSubscriberPublisher&) {
+          gate->pass([this] {
+            guard("connection", [this] {
+              std::lock_guard<std::mutex> lock(connect_mutex_);
+              if (initialized_) updateSubscriptions();
+            });
+          });
+        };
     return handle.advertise<M>(topic, static_cast<uint32_t>(queue_size), changed, changed);
   }
 
@@ -108,10 +153,14 @@ class FusionNodelet : public nodelet::Nodelet {
   bool mayReport(const std::string& key);
   void watch();
 
+  std::shared_ptr<CallbackGate> gate_ = std::make_shared<CallbackGate>();
   Rig rig_;
   Health health_;
   std::mutex connect_mutex_;
   bool initialized_ = false;  ///< guarded by connect_mutex_
+  mutable std::mutex clock_mutex_;
+  mutable StampNs clock_ns_ = 0;          ///< last simulated time, and
+  mutable StampNs clock_changed_ns_ = 0;  ///< when it came; both guarded by clock_mutex_
   std::mutex report_mutex_;
   std::map<std::string, Health::Clock::time_point> reported_;
   Health::Clock::time_point started_ = Health::Clock::now();

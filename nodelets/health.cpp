@@ -7,14 +7,21 @@ namespace semantic_lidar_fusion {
 
 constexpr std::chrono::seconds Health::kErrorHold;
 
-void Health::expectInput(const std::string& topic) {
+void Health::expectInput(const std::string& topic, Expect expect) {
   std::lock_guard<std::mutex> lock(mutex_);
-  inputs_[topic];
+  inputs_[topic].expect = expect;
+}
+
+void Health::retireInput(const std::string& topic) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  inputs_.erase(topic);
 }
 
 void Health::received(const std::string& topic) {
   std::lock_guard<std::mutex> lock(mutex_);
-  Flow& flow = inputs_[topic];
+  const auto found = inputs_.find(topic);
+  if (found == inputs_.end()) return;  // a straggler of a subscription that has ended
+  Flow& flow = found->second;
   ++flow.messages;
   flow.last = Clock::now();
 }
@@ -29,7 +36,17 @@ void Health::published(const std::string& topic) {
 void Health::count(const std::string& reason, std::uint64_t events) {
   if (events == 0) return;
   std::lock_guard<std::mutex> lock(mutex_);
-  events_[reason].total += events;
+  Event& event = events_[reason];
+  event.total += events;
+  event.is_problem = event.is_problem || reason.compare(0, 7, "dropped") == 0;
+}
+
+void Health::problem(const std::string& reason, std::uint64_t events) {
+  if (events == 0) return;
+  std::lock_guard<std::mutex> lock(mutex_);
+  Event& event = events_[reason];
+  event.total += events;
+  event.is_problem = true;
 }
 
 void Health::stage(const std::string& name, double milliseconds) {
@@ -61,7 +78,8 @@ std::vector<std::string> Health::silentInputs(std::chrono::duration<double> age)
   std::lock_guard<std::mutex> lock(mutex_);
   std::vector<std::string> silent;
   for (const auto& [topic, flow] : inputs_) {
-    if (flow.messages == 0 || Clock::now() - flow.last > age) silent.push_back(topic);
+    const bool is_stale = flow.expect == Expect::kStream && Clock::now() - flow.last > age;
+    if (flow.messages == 0 || is_stale) silent.push_back(topic);
   }
   return silent;
 }
@@ -104,7 +122,7 @@ void Health::fill(diagnostic_updater::DiagnosticStatusWrapper& status) {
   }
   for (auto& [reason, event] : events_) {
     status.add(reason, event.total);
-    if (event.total > event.at_last_fill && reason.compare(0, 7, "dropped") == 0) {
+    if (event.total > event.at_last_fill && event.is_problem) {
       status.mergeSummary(DiagnosticStatus::WARN, reason);
     }
     event.at_last_fill = event.total;

@@ -19,13 +19,21 @@ class Health {
  public:
   using Clock = std::chrono::steady_clock;
 
+  enum class Expect : std::uint8_t {
+    kStream,  ///< missed when it falls silent
+    kOnce,    ///< missed only until its first message, e.g. a latched camera_info
+  };
   /// Declares an input so that it is shown, and missed, before its first message.
-  void expectInput(const std::string& topic);
+  void expectInput(const std::string& topic, Expect expect = Expect::kStream);
+  /// An input that is no longer subscribed: neither shown nor missed.
+  void retireInput(const std::string& topic);
   void received(const std::string& topic);
   void published(const std::string& topic);
   /// Counts an event under `reason`, e.g. "dropped: queue full". Reasons that start with "dropped"
   /// raise the level to WARN while they grow.
   void count(const std::string& reason, std::uint64_t events = 1);
+  /// Counts an event that raises the level to WARN while it grows, whatever its name.
+  void problem(const std::string& reason, std::uint64_t events = 1);
   /// Wall time of one step of the work.
   void stage(const std::string& name, double milliseconds);
   /// A value to show as it is (queue length, age, image size).
@@ -45,6 +53,7 @@ class Health {
   static constexpr std::chrono::seconds kErrorHold{10};
 
   struct Flow {
+    Expect expect = Expect::kStream;
     std::uint64_t messages = 0;
     std::uint64_t at_last_fill = 0;
     Clock::time_point last{};
@@ -55,6 +64,7 @@ class Health {
     double max_ms = 0;
   };
   struct Event {
+    bool is_problem = false;
     std::uint64_t total = 0;
     std::uint64_t at_last_fill = 0;
   };

@@ -29,6 +29,9 @@ constexpr std::size_t kKnownStamps = 64;
 }  // namespace
 
 class ImageSelectionNodelet : public FusionNodelet {
+ public:
+  ~ImageSelectionNodelet() override { stop(); }
+
  private:
   struct Image {
     sensor_msgs::ImageConstPtr raw;
@@ -73,11 +76,11 @@ class ImageSelectionNodelet : public FusionNodelet {
     }
     if (wanted == static_cast<bool>(lidar_subscriber_)) return;
     if (!wanted) {
-      lidar_subscriber_.shutdown();
+      unsubscribe(&lidar_subscriber_);
       for (const auto& camera : cameras_) {
-        camera->images_subscriber.shutdown();
-        camera->semantics_subscriber.shutdown();
-        camera->info_subscriber.shutdown();
+        unsubscribe(&camera->images_subscriber);
+        unsubscribe(&camera->semantics_subscriber);
+        unsubscribe(&camera->info_subscriber);
       }
       return;
     }
@@ -95,28 +98,27 @@ class ImageSelectionNodelet : public FusionNodelet {
     const CameraConfig& config = camera.config;
     if (config.transport == ImageTransport::kCompressed) {
       camera.images_subscriber = subscribe<sensor_msgs::CompressedImage>(
-          getNodeHandle(), imageTopic(config), 8,
+          getNodeHandle(), imageTopic(config), 32,
           [this, index](const sensor_msgs::CompressedImageConstPtr& image) {
             onImage(index, {nullptr, image}, stampNs(image->header.stamp));
           });
     } else {
       camera.images_subscriber = subscribe<sensor_msgs::Image>(
-          getNodeHandle(), imageTopic(config), 8,
+          getNodeHandle(), imageTopic(config), 32,
           [this, index](const sensor_msgs::ImageConstPtr& image) {
             onImage(index, {image, nullptr}, stampNs(image->header.stamp));
           });
     }
     if (candidatesNeedSemantics()) {
       camera.semantics_subscriber = subscribe<sensor_msgs::Image>(
-          getNodeHandle(), semanticsTopic(rig(), config), 8,
+          getNodeHandle(), semanticsTopic(rig(), config), 32,
           [this, index](const sensor_msgs::ImageConstPtr& scores) { onSemantics(index, *scores); });
     }
     if (sweep_) {
       camera.info_subscriber = subscribe<sensor_msgs::CameraInfo>(
           getNodeHandle(), inputTopic(config, config.camera_info), 8,
-          [&camera](const sensor_msgs::CameraInfoConstPtr& info) {
-            camera.geometry.update(*info);
-          });
+          [&camera](const sensor_msgs::CameraInfoConstPtr& info) { camera.geometry.update(*info); },
+          Health::Expect::kOnce);
     }
   }
 
@@ -142,7 +144,9 @@ class ImageSelectionNodelet : public FusionNodelet {
     const StampNs stamp = stampNs(scores.header.stamp);
     if (scores.data.empty() || !usable(semanticsTopic(rig(), camera.config), stamp)) return;
     camera.semantics.put(stamp, true);
-    if (camera.images.find(stamp) != nullptr) {
+    // Nothing is clustered for a camera that brings probabilities: it needs no image.
+    if (camera.config.input == CameraInput::kProbabilities ||
+        camera.images.find(stamp) != nullptr) {
       selector_->addImage(index, stamp);
       decide();
     }
@@ -154,8 +158,9 @@ class ImageSelectionNodelet : public FusionNodelet {
     for (const auto& [stamp, image] : camera->images.values()) bytes += image.bytes();
     while (bytes > kMaxImageBytes && camera->images.size() > 1) {
       const auto oldest = camera->images.values().begin();
+      const StampNs stamp = oldest->first;
       bytes -= oldest->second.bytes();
-      camera->images.erase(oldest->first);
+      camera->images.erase(stamp);
     }
   }
 
@@ -226,7 +231,7 @@ class ImageSelectionNodelet : public FusionNodelet {
     const SelectorDecisions decisions = selector_->advance(now());
     for (const ReferenceDecision& decision : decisions.references) {
       if (decision.timed_out) {
-        health().count("t_ref is the middle of the scan: no reference image in time");
+        health().problem("t_ref is the middle of the scan: no reference image in time");
       }
       publish(reference_, boost::make_shared<sensor_msgs::TimeReference>(
                               scanReferenceMessage(decision.scan_ns, decision.reference_ns)));
@@ -246,7 +251,8 @@ class ImageSelectionNodelet : public FusionNodelet {
     Camera& camera = *cameras_[static_cast<std::size_t>(decision.camera)];
     const std::string& name = camera.config.name;
     if (!decision.image_stamp) {
-      health().count(name + (decision.timed_out ? ": no image, timed out" : ": no image in time"));
+      health().problem(name +
+                       (decision.timed_out ? ": no image, timed out" : ": no image in time"));
     }
     publish(camera.selection, boost::make_shared<sensor_msgs::TimeReference>(
                                   selectionMessage(decision.scan_ns, decision.image_stamp, name)));
@@ -255,6 +261,7 @@ class ImageSelectionNodelet : public FusionNodelet {
       return;
     }
     const Image* image = camera.images.find(*decision.image_stamp);
+    if (image == nullptr && camera.config.input == CameraInput::kProbabilities) return;
     if (image == nullptr) {
       health().count("dropped: " + name + " image left the buffer before it was chosen");
       return;

@@ -31,6 +31,9 @@ constexpr StampNs kReferenceGraceNs = 500000000;
 }  // namespace
 
 class MotionCompensationNodelet : public FusionNodelet {
+ public:
+  ~MotionCompensationNodelet() override { stop(); }
+
  private:
   struct Scan {
     TimedCloud cloud;
@@ -67,8 +70,8 @@ class MotionCompensationNodelet : public FusionNodelet {
                     getNodeHandle(), rig().lidar.topic, 8,
                     &MotionCompensationNodelet::onScan<sensor_msgs::PointCloud2>);
     } else if (!wanted && references_subscriber_) {
-      references_subscriber_.shutdown();
-      lidar_subscriber_.shutdown();
+      unsubscribe(&references_subscriber_);
+      unsubscribe(&lidar_subscriber_);
     }
   }
 
@@ -122,7 +125,6 @@ class MotionCompensationNodelet : public FusionNodelet {
       health().count("dropped: scan pending at a clock jump", pending_.size());
       pending_.clear();
       references_.clear();
-      tf_->source().clear();
       NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
     }
     if (verdict == StampVerdict::kStale) {
@@ -165,7 +167,7 @@ class MotionCompensationNodelet : public FusionNodelet {
       const StampNs waited_since = std::max(scan.arrived_ns, reference->arrived_ns);
       if (!complete && now() - waited_since < toNs(rig().odometry.timeout_s)) return;
       if (!complete) {
-        health().count("odometry timeouts");
+        health().problem("odometry timeouts");
         warn("odometry", "scan without full odometry after " +
                              std::to_string(rig().odometry.timeout_s) +
                              " s: " + (T_vehicle_lidar ? gap : T_vehicle_lidar.message));

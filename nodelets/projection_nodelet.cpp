@@ -25,12 +25,16 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-/// Images whose semantics are kept per camera: one image can serve two scans.
-constexpr std::size_t kKeptImages = 12;
+/// Images whose semantics are kept per camera. One image can serve two scans; a free-running
+/// network sends scores of images long before a scan chooses one: 0.8 s at 30 Hz.
+constexpr std::size_t kKeptImages = 24;
 
 }  // namespace
 
 class ProjectionNodelet : public FusionNodelet {
+ public:
+  ~ProjectionNodelet() override { stop(); }
+
  private:
   /// The parts of one image's semantics, as they come.
   struct Semantics {
@@ -51,7 +55,7 @@ class ProjectionNodelet : public FusionNodelet {
   };
 
   void initialize() override {
-    chain_ = std::make_unique<FusionChain>(rig());
+    chain_ = std::make_unique<FusionChain>(rig(), /*with_network=*/false);
 
     FusionQueueConfig queue;
     for (const CameraConfig& camera : rig().cameras)
@@ -70,9 +74,8 @@ class ProjectionNodelet : public FusionNodelet {
       // Camera_info is read from the start: it may be latched, or come only once.
       camera.info = subscribe<sensor_msgs::CameraInfo>(
           getNodeHandle(), inputTopic(camera.config, camera.config.camera_info), 8,
-          [&camera](const sensor_msgs::CameraInfoConstPtr& info) {
-            camera.geometry.update(*info);
-          });
+          [&camera](const sensor_msgs::CameraInfoConstPtr& info) { camera.geometry.update(*info); },
+          Health::Expect::kOnce);
     }
     startTicking();
   }
@@ -87,8 +90,8 @@ class ProjectionNodelet : public FusionNodelet {
       cloud_subscriber_ = subscribe<sensor_msgs::PointCloud2>(getNodeHandle(), "points_compensated",
                                                               8, &ProjectionNodelet::onCloud);
     } else if (!wanted && cloud_subscriber_) {
-      reference_subscriber_.shutdown();
-      cloud_subscriber_.shutdown();
+      unsubscribe(&reference_subscriber_);
+      unsubscribe(&cloud_subscriber_);
     }
   }
 
@@ -99,12 +102,12 @@ class ProjectionNodelet : public FusionNodelet {
             void (ProjectionNodelet::*callback)(Camera*, const sensor_msgs::ImageConstPtr&)) {
           if (needed && !*subscriber) {
             *subscriber = subscribe<sensor_msgs::Image>(
-                getNodeHandle(), topic, 8,
+                getNodeHandle(), topic, 32,
                 [this, camera, callback](const sensor_msgs::ImageConstPtr& message) {
                   (this->*callback)(camera, message);
                 });
           } else if (!needed && *subscriber) {
-            subscriber->shutdown();
+            unsubscribe(subscriber);
           }
         };
     if (wanted && !camera->selection) {
@@ -114,7 +117,7 @@ class ProjectionNodelet : public FusionNodelet {
             onSelection(camera, *message);
           });
     } else if (!wanted && camera->selection) {
-      camera->selection.shutdown();
+      unsubscribe(&camera->selection);
     }
     const bool scores = config.input == CameraInput::kScores;
     images(wanted && scores, semanticsTopic(rig(), config), &camera->scores,
@@ -176,7 +179,7 @@ class ProjectionNodelet : public FusionNodelet {
     const StampNs stamp = stampNs(message->header.stamp);
     if (!current(camera->config.name + " " + source, stamp)) return;
     if (message->width == 0 || message->height == 0) {
-      health().count(camera->config.name + ": the network gave no scores for a selected image");
+      health().problem(camera->config.name + ": the network gave no scores for a selected image");
       queue_->setSemantics(camera->index, stamp, false);
     } else {
       if (camera->semantics.find(stamp) == nullptr) camera->semantics.put(stamp, {});
@@ -198,7 +201,6 @@ class ProjectionNodelet : public FusionNodelet {
       health().count("clock jumps");
       health().count("dropped: scan pending at a clock jump", queue_->pending());
       queue_->reset();
-      tf_->source().clear();
       for (const auto& camera : cameras_) {
         camera->semantics.clear();
         camera->images.clear();
@@ -266,13 +268,13 @@ class ProjectionNodelet : public FusionNodelet {
     const std::string& name = camera.config.name;
     CameraPlace place;
     if (!camera.geometry.model()) {
-      health().count(name + ": no usable camera_info");
+      health().problem(name + ": no usable camera_info");
       return place;
     }
     const TransformAnswer T_camera_lidar =
         tf_->source().extrinsics(camera.geometry.frame(), lidar_frame);
     if (!T_camera_lidar) {
-      health().count(name + ": no extrinsics");
+      health().problem(name + ": no extrinsics");
       warn("extrinsics " + name, name + ": " + T_camera_lidar.message);
       return place;
     }
@@ -285,14 +287,14 @@ class ProjectionNodelet : public FusionNodelet {
   std::optional<SegmentedImage> imageOf(const Camera& camera, const CompletedScan::View& state) {
     const std::string& name = camera.config.name;
     if (state.state != ViewState::kReady) {
-      health().count(name + (state.state == ViewState::kNone ? ": no image in time"
-                             : state.timed_out               ? ": timed out"
-                                                             : ": no scores"));
+      health().problem(name + (state.state == ViewState::kNone ? ": no image in time"
+                               : state.timed_out               ? ": timed out"
+                                                               : ": no scores"));
       return std::nullopt;
     }
     const Semantics* known = camera.semantics.find(state.image_stamp);
     if (known == nullptr) {
-      health().count(name + ": semantics left the buffer");
+      health().problem(name + ": semantics left the buffer");
       return std::nullopt;
     }
     SegmentedImage image;

@@ -24,12 +24,18 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-/// Images that wait for their scores, and scores that wait for their image, per camera.
+/// Selected images that wait for their scores, per camera.
 constexpr std::size_t kWaiting = 4;
+/// Scores that wait for a scan to choose their image, which many never see: a free-running network
+/// sends those of every image, and a scan comes as much as its own length later. 0.8 s at 30 Hz.
+constexpr std::size_t kWaitingScores = 24;
 
 }  // namespace
 
 class SuperpixelUncertaintyNodelet : public FusionNodelet {
+ public:
+  ~SuperpixelUncertaintyNodelet() override { stop(); }
+
  private:
   struct Camera {
     explicit Camera(const Rig& rig, const CameraConfig& config)
@@ -40,7 +46,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     CameraSemantics semantics;
     EpochMonitor epoch;
     StampedStore<sensor_msgs::ImageConstPtr> images{kWaiting};
-    StampedStore<sensor_msgs::ImageConstPtr> scores{kWaiting};
+    StampedStore<sensor_msgs::ImageConstPtr> scores{kWaitingScores};
     StampedStore<std::shared_ptr<const SuperpixelMap>> maps{kWaiting};
 
     ros::Publisher share, superpixels, probabilities, overlay;
@@ -93,12 +99,12 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
               ros::Subscriber* subscriber) {
     if (wanted && !*subscriber) {
       *subscriber = subscribe<sensor_msgs::Image>(
-          getMTNodeHandle(), topic, 4,
+          getMTNodeHandle(), topic, 16,
           [this, camera, callback](const sensor_msgs::ImageConstPtr& image) {
             (this->*callback)(camera, image);
           });
     } else if (!wanted && *subscriber) {
-      subscriber->shutdown();
+      unsubscribe(subscriber);
     }
   }
 
@@ -127,7 +133,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
       if (!current(camera, "scores", scores)) return;
       camera->semantics.noteScores(pixelView(*scores));
       const StampNs stamp = stampNs(scores->header.stamp);
-      health().count("dropped: " + camera->config.name + " scores without image",
+      health().count(camera->config.name + " scores of images that no scan chose",
                      camera->scores.put(stamp, scores));
       outputs = combine(camera, stamp);
     }

@@ -106,6 +106,9 @@ bool TfPoseSource::add(const geometry_msgs::TransformStamped& message, bool is_s
   if (config_.source == OdometrySource::kTf && !off_chain) {
     edge.unread.push_back(stamp);
     if (edge.unread.size() > kMaxUnread) edge.unread.pop_front();
+    // At once: tf2 gives its newest transform exactly, an older one after an interpolation that
+    // changes the last bits, and the poses must not depend on when they are asked for.
+    readTf();
   }
   return true;
 }

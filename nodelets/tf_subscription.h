@@ -5,12 +5,18 @@
 #include <ros/ros.h>
 #include <tf2_msgs/TFMessage.h>
 
+#include <string>
+
+#include "conversions.h"
 #include "semantic_lidar_fusion/config/rig.h"
+#include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "tf_pose_source.h"
 
 namespace semantic_lidar_fusion {
 
 /// Feeds a TfPoseSource from /tf, /tf_static and, where the rig says so, an odometry topic.
+/// A jump of its own stamps makes it forget what moves: transforms of a bag's new pass may come
+/// before the first message of any other sensor, and must outlive the jump that that one shows.
 /// Callbacks run on the queue of the node handle: use the source from that queue only.
 class TfSubscription {
  public:
@@ -34,7 +40,9 @@ class TfSubscription {
       odometry_ = handle.subscribe<nav_msgs::Odometry>(
           rig.odometry.topic, 100,
           boost::function<void(const nav_msgs::OdometryConstPtr&)>(
-              [this](const nav_msgs::OdometryConstPtr& message) { source_.add(*message); }),
+              [this](const nav_msgs::OdometryConstPtr& message) {
+                if (current(message->child_frame_id, message->header.stamp)) source_.add(*message);
+              }),
           ros::VoidConstPtr(), hints);
     }
   }
@@ -43,10 +51,23 @@ class TfSubscription {
 
  private:
   void add(const tf2_msgs::TFMessage& message, bool is_static) {
-    for (const auto& transform : message.transforms) source_.add(transform, is_static);
+    for (const auto& transform : message.transforms) {
+      if (is_static || current(transform.child_frame_id, transform.header.stamp)) {
+        source_.add(transform, is_static);
+      }
+    }
+  }
+
+  /// False for what is from before a jump.
+  bool current(const std::string& child_frame, const ros::Time& stamp) {
+    if (stamp.isZero()) return true;  // the source counts it
+    const StampVerdict verdict = epoch_.observe(child_frame, stampNs(stamp));
+    if (verdict == StampVerdict::kNewEpoch) source_.clear();
+    return verdict != StampVerdict::kStale;
   }
 
   TfPoseSource source_;
+  EpochMonitor epoch_;
   ros::Subscriber static_, moving_, odometry_;
 };
 

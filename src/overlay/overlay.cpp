@@ -294,7 +294,7 @@ cv::Mat scaleBar(int width) {
   const int left = style.small_px;
   const int bar_width = width - 2 * left;
   cv::Mat panel(3 * style.line_px, width, CV_8UC3, kPanel);
-  cv::putText(panel, "share of the most frequent label in the superpixel",
+  cv::putText(panel, "share of the prevalent label in its superpixel",
               {left, style.line_px / 2 + style.small_px / 2}, cv::FONT_HERSHEY_SIMPLEX,
               style.font_scale, kText, style.thickness, cv::LINE_AA);
   const int top = style.line_px;

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <numeric>
 #include <optional>
@@ -116,22 +117,32 @@ RangeImage rangeImage(const Cloud& cloud, const OcclusionConfig& config) {
 /// The most frequent step between sorted azimuths: gaps and dropouts make multiples of it, second
 /// returns make zeros.
 double azimuthStep(std::vector<float>* steps) {
-  constexpr float kSmallest = 3e-4f;  // 0.017 deg
-  constexpr double kBinsPerOctave = 8.0;
-  constexpr int kBins = 100;
-  std::vector<int> count(kBins + 2, 0);
+  // The exponent and the first three bits of the mantissa of a float: eight bins per octave.
+  const auto bin = [](float value) {
+    std::uint32_t bits;
+    std::memcpy(&bits, &value, sizeof(bits));
+    return static_cast<int>(bits >> 20);
+  };
+  constexpr float kSmallest = 3e-4f, kLargest = 1.0f;  // 0.017 deg .. 57 deg
+  const int first = bin(kSmallest) - 1;
+  std::vector<int> count(static_cast<std::size_t>(bin(kLargest) - first) + 2, 0);
+  std::vector<double> sum(count.size(), 0.0);
   for (const float step : *steps) {
-    if (step < kSmallest) continue;
-    const int bin = static_cast<int>(std::log2(step / kSmallest) * kBinsPerOctave);
-    if (bin < kBins) ++count[bin + 1];
+    if (!(step >= kSmallest && step < kLargest)) continue;
+    const auto place = static_cast<std::size_t>(bin(step) - first);
+    ++count[place];
+    sum[place] += step;
   }
-  int best = 0, best_bin = -1;
-  for (int bin = 1; bin <= kBins; ++bin) {
-    const int near = count[bin - 1] + 2 * count[bin] + count[bin + 1];
-    if (near > best) best = near, best_bin = bin;
+  int most = 0;
+  double mode = 0.0;
+  for (std::size_t k = 1; k + 1 < count.size(); ++k) {
+    const int near = count[k - 1] + 2 * count[k] + count[k + 1];
+    if (near > most && count[k] > 0) {
+      most = near;
+      mode = sum[k] / count[k];
+    }
   }
-  if (best_bin < 0) return 0.0;
-  const double mode = kSmallest * std::exp2((best_bin - 0.5) / kBinsPerOctave);
+  if (most == 0) return 0.0;
   steps->erase(std::remove_if(steps->begin(), steps->end(),
                               [&](float s) { return s < 0.6 * mode || s > 1.5 * mode; }),
                steps->end());
@@ -359,29 +370,29 @@ class Linker {
     const std::uint32_t begin = image_.row_begin[row];
     const std::uint32_t count = image_.row_begin[row + 1] - begin;
     int run = 0;
-    float slope = 0.0f, jump = 0.0f;
-    std::int32_t last = kNone;
+    std::int32_t last = kNone, last_across = kNone;
+    const auto slope = [&](std::int32_t i, std::int32_t j) {
+      const Eigen::Vector3f step = point(j) - point(i);
+      return std::atan2(step.z(), step.head<2>().norm());
+    };
+    const auto jump = [&](std::int32_t i, std::int32_t j) {
+      return image_.range[static_cast<std::size_t>(j)] - image_.range[static_cast<std::size_t>(i)];
+    };
+    const auto alike = [&](std::int32_t i, std::int32_t j) {
+      const float before = jump(last, last_across);
+      return std::abs(jump(i, j) - before) <= std::max(0.2f, 0.25f * std::abs(before)) &&
+             std::abs(slope(i, j) - slope(last, last_across)) <= static_cast<float>(kStraight_rad);
+    };
     for (std::uint32_t n = 0; n < 2 * count; ++n) {  // twice around: the start has a run too
       const std::uint32_t k = n < count ? n : n - count;
       const auto i = static_cast<std::int32_t>(image_.order[begin + (to_left ? k : count - 1 - k)]);
       Links& own = links_[static_cast<std::size_t>(i)];
       if (last == kNone || (to_left ? own.right : own.left) != last) run = 0;
-      last = i;
       const std::int32_t j = near_[static_cast<std::size_t>(i)].*side;
-      if (j == kNone) {
-        run = 0;
-        continue;
-      }
-      const Eigen::Vector3f step = point(j) - point(i);
-      const float own_slope = std::atan2(step.z(), step.head<2>().norm());
-      const float own_jump = image_.range[j] - image_.range[i];
-      const bool alike = run >= kCarryRun &&
-                         std::abs(own_slope - slope) <= static_cast<float>(kStraight_rad) &&
-                         std::abs(own_jump - jump) <= std::max(0.2f, 0.25f * std::abs(jump));
-      if (own.*side == kNone && alike) own.*side = j;
+      if (own.*side == kNone && j != kNone && run >= kCarryRun && alike(i, j)) own.*side = j;
       run = own.*side != kNone ? run + 1 : 0;
-      slope = own_slope;
-      jump = own_jump;
+      last = i;
+      last_across = j;
     }
   }
 

@@ -77,6 +77,7 @@ class Camera:
     height: int = 240
     focal: float = 110.0
     score_step: int = 2  # image pixels per score cell
+    clock_ahead_ns: int = 0  # its stamps are later than the truth by this
 
     def pose(self) -> np.ndarray:
         """T_vehicle_camera."""
@@ -135,12 +136,19 @@ class Drive:
         """T_vehicle_lidar."""
         return matrix(1.0, 0.0, 0.5, yaw(0.05))
 
+    def poses(self, t: np.ndarray) -> np.ndarray:
+        """T_fixed_vehicle (n, 4, 4) at t (n,) s after START_NS; constant twist, near the middle."""
+        w = self.yaw_rate if self.yaw_rate else 1e-12
+        result = np.tile(np.eye(4), (len(t), 1, 1))
+        c, s = np.cos(w * t), np.sin(w * t)
+        result[:, 0, 0], result[:, 0, 1], result[:, 1, 0], result[:, 1, 1] = c, -s, s, c
+        result[:, 0, 3] = self.origin[0] - 4.0 + self.speed * s / w
+        result[:, 1, 3] = self.origin[1] - 1.0 + self.speed * (1 - c) / w
+        return result
+
     def pose(self, t: float) -> np.ndarray:
-        """T_fixed_vehicle at t s after START_NS; constant twist, in the middle of the room."""
-        w = self.yaw_rate
-        x = self.speed * (np.sin(w * t) / w if w else t)
-        y = self.speed * ((1 - np.cos(w * t)) / w if w else 0.0)
-        return matrix(self.origin[0] + x - 4.0, self.origin[1] + y - 1.0, 0.0, yaw(w * t))
+        """T_fixed_vehicle at t s after START_NS."""
+        return self.poses(np.array([t]))[0]
 
     def scan_start_ns(self, index: int) -> int:
         """Time of the first point of a scan."""
@@ -207,7 +215,7 @@ class Drive:
 
     def cast_lidar(self, directions: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Ranges (n,) of unit directions (n, 3) in the lidar's frame, each at its own time (n,)."""
-        poses = np.stack([self.pose(t) @ self.lidar_pose for t in times])
+        poses = self.poses(times) @ self.lidar_pose
         world = np.einsum("nij,nj->ni", poses[:, :3, :3], directions)
         return self.cast(poses[:, :3, 3], world)
 
@@ -397,6 +405,7 @@ def write_bag(path: str, drive: Drive) -> None:
             if not wanted:
                 continue
             labels = drive.label_image(camera, (time_ns - START_NS) * 1e-9)
+            time_ns += camera.clock_ahead_ns
             noise = random.randint(-6, 7, labels.shape + (3,))
             colors = np.array(CLASS_COLORS)[labels][..., ::-1]  # BGR
             pixels = np.clip(colors + noise, 0, 255).astype(np.uint8)
@@ -463,6 +472,8 @@ def rig_text(drive: Drive, extra: str = "") -> str:
     for camera in drive.cameras:
         lines.append("  - name: %s" % camera.name)
         lines.append("    namespace: /%s" % camera.name)
+        if camera.clock_ahead_ns:
+            lines.append("    time_offset: %.9f" % (-1e-9 * camera.clock_ahead_ns))
         if drive.image_transport == "compressed":
             lines.append("    transport: compressed")
         if drive.semantics in ("labels", "probabilities"):

@@ -10,9 +10,11 @@ fail() {
 }
 
 run_installed() {
+  mkdir -p "$SLF_BUILD_DIR/ros_home/install_check"
+  # The setup file reads the positional parameters: it gets none.
   (cd / && env -i PATH=/usr/bin:/bin HOME="$SLF_BUILD_DIR" LC_ALL=C.UTF-8 PYTHONDONTWRITEBYTECODE=1 \
     ROS_HOME="$SLF_BUILD_DIR/ros_home/install_check" \
-    bash -c 'source "$0/setup.bash" && exec "$@"' "$space" "$@")
+    bash -c 'command=("$@"); set --; source "$0/setup.bash" && exec "${command[@]}"' "$space" "$@")
 }
 
 check_install_space() {

@@ -1,0 +1,764 @@
+# SPDX-License-Identifier: MIT
+"""fuse_bag on bags of exactly known truth (bag_factory), and on bags that are none."""
+import hashlib
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+bag_factory = pytest.importorskip("bag_factory")
+import rosbag  # noqa: E402
+
+from bag_factory import CLASS_NAMES, START_NS, Camera, Drive, read_cloud  # noqa: E402
+
+
+def program():
+    """fuse_bag of this build."""
+    candidates = [os.environ.get("SLF_BIN_DIR", ""), os.environ.get("SLF_BUILD_DIR", "")]
+    for folder in candidates:
+        path = os.path.join(folder, "fuse_bag")
+        if folder and os.path.exists(path):
+            return path
+    pytest.fail("fuse_bag is not built; SLF_BIN_DIR names its folder")
+
+
+def run(*arguments, **options):
+    """Runs fuse_bag; returns the completed process with text output."""
+    return subprocess.run(
+        [program()] + [str(a) for a in arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        universal_newlines=True,
+        timeout=120,
+        **options,
+    )
+
+
+class Made:
+    """A bag of a drive, with its rig file, and what fuse_bag makes of it."""
+
+    def __init__(self, folder, drive, rig_extra=""):
+        self.folder, self.drive = folder, drive
+        self.bag, self.rig = folder / "in.bag", folder / "rig.yaml"
+        bag_factory.write_bag(str(self.bag), drive)
+        self.rig.write_text(bag_factory.rig_text(drive, rig_extra))
+
+    def fuse(self, *options, name="out.bag", expect=0):
+        result = run(self.bag, self.folder / name, "--rig", self.rig, *options)
+        assert result.returncode == expect, result.stderr + result.stdout
+        return Fused(self.folder / name, result) if expect == 0 else result
+
+
+class Fused:
+    """The messages of an output bag by topic."""
+
+    def __init__(self, path, result):
+        self.path, self.result = path, result
+        self.messages = {}
+        with rosbag.Bag(str(path)) as bag:
+            for topic, message, time in bag.read_messages():
+                self.messages.setdefault(topic, []).append((time.to_nsec(), message))
+            self.types = {t: i.msg_type for t, i in bag.get_type_and_topic_info().topics.items()}
+
+    def of(self, topic):
+        return [message for _, message in self.messages[topic]]
+
+    def clouds(self, topic="/points_semantic"):
+        return [read_cloud(message) for message in self.of(topic)]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """The default drive: three scans of PointCloud2, two cameras."""
+    return Made(tmp_path_factory.mktemp("room"), Drive())
+
+
+@pytest.fixture(scope="module")
+def fused(room):
+    return room.fuse()
+
+
+def world_points(drive, cloud, t_ref_ns):
+    """Points of a cloud that is rigid at t_ref, in the fixed frame."""
+    T = drive.pose((t_ref_ns - START_NS) * 1e-9) @ drive.lidar_pose
+    xyz = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=-1).astype(np.float64)
+    return xyz @ T[:3, :3].T + T[:3, 3]
+
+
+def pixels_in(drive, camera, world, time_ns):
+    """Pixels (n, 2) of points in the fixed frame, and whether the image holds them."""
+    T = np.linalg.inv(drive.pose((time_ns - START_NS) * 1e-9) @ camera.pose())
+    uv, theta = camera.project(world @ T[:3, :3].T + T[:3, 3])
+    inside = (uv > -0.5).all(axis=1) & (uv < [camera.width - 0.5, camera.height - 0.5]).all(axis=1)
+    return uv, inside & (theta < np.pi)
+
+
+def margin_to_border(camera, uv):
+    """Distance in px of pixels (n, 2) to the border of the image, inside or outside."""
+    u, v = uv[:, 0] + 0.5, uv[:, 1] + 0.5
+    return np.min(np.abs([u, camera.width - u, v, camera.height - v]), axis=0)
+
+
+def check_truth(drive, fused, surface_tolerance, least_fused):
+    """Labels, statuses and geometry of the semantic clouds against the room."""
+    total = right = 0
+    for index, message in enumerate(fused.of("/points_semantic")):
+        cloud, t_ref = read_cloud(message), message.header.stamp.to_nsec()
+        world = world_points(drive, cloud, t_ref)
+        assert drive.surface_gap(world).max() < surface_tolerance
+        seen = np.zeros(len(cloud), bool)
+        certain = np.ones(len(cloud), bool)
+        on_edge = np.zeros(len(cloud), bool)
+        for bit, camera in enumerate(drive.cameras):
+            selection = fused.of("/%s/selection" % camera.name)[index].time_ref.to_nsec()
+            assert selection > 0
+            uv, inside = pixels_in(drive, camera, world, selection)
+            seen |= inside
+            certain &= margin_to_border(camera, uv) > 0.3
+            labels = drive.label_image(camera, (selection - START_NS) * 1e-9)
+            pixel = np.clip(np.floor(uv + 0.5), 0, [camera.width - 1, camera.height - 1])
+            column, row = pixel.astype(int).T
+            reach = 2 * camera.score_step
+            for du in (-reach, 0, reach):
+                for dv in (-reach, 0, reach):
+                    r = np.clip(row + dv, 0, camera.height - 1)
+                    c = np.clip(column + du, 0, camera.width - 1)
+                    on_edge |= inside & (labels[r, c] != labels[row, column])
+            contributed = (cloud["cameras"] >> bit & 1) == 1
+            assert (inside | ~certain)[contributed].all(), camera.name
+        in_status = np.isin(cloud["status"], (0, 1))
+        assert np.array_equal(in_status[certain], seen[certain])
+        assert (cloud["status"][certain & ~seen] == 2).all()
+        ok = (cloud["status"] == 0) & ~on_edge & certain
+        truth = drive.class_of(world)
+        total += ok.sum()
+        right += (cloud["label"][ok] == truth[ok]).sum()
+        assert (cloud["status"] == 0).sum() > least_fused * seen.sum()
+    assert total > 500
+    assert right == total
+
+
+def test_labels_statuses_and_motion_are_those_of_the_room(room, fused):
+    # One point's range is cast exactly; f32 coordinates up to 40 m are good to 4e-6 m, and the
+    # poses between readings 10 ms apart to 8 m/s * 0.5 rad/s * (10 ms)^2 / 8 = 0.05 mm.
+    check_truth(room.drive, fused, 1e-3, 0.9)
+
+
+def test_without_occlusion_every_seen_point_is_fused(room):
+    fused = room.fuse("--set", "occlusion.mode=off", name="off.bag")
+    check_truth(room.drive, fused, 1e-3, 0.999)
+    for cloud in fused.clouds():
+        assert not (cloud["status"] == 1).any()
+
+
+def test_packets_give_the_same_truth(tmp_path):
+    made = Made(tmp_path, Drive(lidar="packets", scans=2))
+    # A range unit is 2 mm: half of it; the azimuth unit of 0.01 deg at 24 m makes 2 mm more along
+    # the surface, which grazing incidence turns into a distance of at most that.
+    check_truth(made.drive, made.fuse(), 6e-3, 0.9)
+
+
+def test_large_coordinates_change_nothing(tmp_path):
+    made = Made(tmp_path, Drive(scans=1, origin=(331275.0, 6250099.0)))
+    check_truth(made.drive, made.fuse(), 1e-3, 0.9)
+
+
+def test_compressed_images_and_bag_give_the_same_as_raw(tmp_path, fused):
+    made = Made(tmp_path, Drive(image_transport="compressed", compression="lz4"))
+    other = made.fuse()
+    for ours, theirs in zip(other.of("/points_semantic"), fused.of("/points_semantic")):
+        assert ours.data == theirs.data
+
+
+def test_odometry_topic_gives_the_same_as_tf(tmp_path, fused):
+    made = Made(tmp_path, Drive(odometry="topic"))
+    for ours, theirs in zip(made.fuse().clouds(), fused.clouds()):
+        for axis in "xyz":
+            assert np.abs(ours[axis] - theirs[axis]).max() < 1e-5
+
+
+@pytest.mark.parametrize("semantics", ["labels", "probabilities"])
+def test_other_inputs(tmp_path, semantics):
+    made = Made(tmp_path, Drive(scans=1, semantics=semantics))
+    check_truth(made.drive, made.fuse(), 1e-3, 0.9)
+
+
+def test_topics_types_and_stamps(room, fused):
+    expected = {
+        "/class_info": "std_msgs/String",
+        "/scan_reference": "sensor_msgs/TimeReference",
+        "/front/selection": "sensor_msgs/TimeReference",
+        "/left/selection": "sensor_msgs/TimeReference",
+        "/points_compensated": "sensor_msgs/PointCloud2",
+        "/points_semantic": "sensor_msgs/PointCloud2",
+    }
+    assert fused.types == expected
+    for topic, messages in fused.messages.items():
+        if topic != "/class_info":
+            assert [t for t, _ in messages] == [m.header.stamp.to_nsec() for _, m in messages]
+            assert len(messages) == room.drive.scans
+    for index, reference in enumerate(fused.of("/scan_reference")):
+        first = room.drive.scan_start_ns(index)
+        assert reference.header.stamp.to_nsec() == first
+        columns = room.drive.points_per_scan // 16
+        last = first + (columns - 1) * (100_000_000 // columns)
+        middle = first + (last - first) // 2
+        stamps = room.drive.image_stamps_ns(room.drive.cameras[0])
+        t_ref = min(stamps, key=lambda s: (abs(s - middle), s))
+        assert reference.time_ref.to_nsec() == t_ref
+        for camera in room.drive.cameras:
+            stamps = room.drive.image_stamps_ns(camera)
+            closest = min(stamps, key=lambda s: (abs(s - t_ref), s))
+            chosen = fused.of("/%s/selection" % camera.name)[index]
+            assert chosen.header.stamp.to_nsec() == first
+            assert chosen.time_ref.to_nsec() == closest
+        for topic in ("/points_compensated", "/points_semantic"):
+            cloud = fused.of(topic)[index]
+            assert cloud.header.stamp.to_nsec() == t_ref
+            assert cloud.header.frame_id == "velodyne"
+            assert (cloud.height, cloud.is_dense) == (1, True)
+    classes = json.loads(fused.of("/class_info")[0].data)["classes"]
+    assert [c["name"] for c in classes] == list(CLASS_NAMES)
+
+
+def test_fields_of_points_without_a_class(fused):
+    for cloud in fused.clouds():
+        none = cloud["status"] != 0
+        assert none.any() and (~none).any()
+        assert (cloud["label"][none] == 255).all()
+        assert (cloud["confidence"][none] == 0).all()
+        assert (cloud["entropy"][none] == 1).all()
+        assert (cloud["cameras"][none] == 0).all()
+        p = np.stack([cloud["p_" + name] for name in CLASS_NAMES], axis=-1)
+        assert (p[none] == 0).all()
+        assert np.abs(p[~none].sum(axis=1) - 1).max() < 1e-5
+        assert np.array_equal(p[~none].argmax(axis=1), cloud["label"][~none])
+        assert np.array_equal(p[~none].max(axis=1), cloud["confidence"][~none])
+        assert np.isfinite(cloud["entropy"]).all()
+
+
+def test_semantic_cloud_holds_the_compensated_points(fused):
+    for semantic, rigid in zip(fused.clouds(), fused.clouds("/points_compensated")):
+        for field in ("x", "y", "z", "intensity", "ring", "dt"):
+            assert np.array_equal(semantic[field], rigid[field])
+        assert (rigid["status"] == 0).all()
+
+
+def test_same_bag_twice_gives_the_same_bytes(room, fused):
+    again = room.fuse(name="again.bag")
+    assert digest(again.path) == digest(fused.path)
+
+
+def test_all_outputs_are_deterministic_and_complete(room):
+    first = room.fuse("--all", name="all1.bag")
+    second = room.fuse("--all", name="all2.bag")
+    assert digest(first.path) == digest(second.path)
+    for camera in room.drive.cameras:
+        chosen = {m.time_ref.to_nsec() for m in first.of("/%s/selection" % camera.name)}
+        sizes = {
+            "superpixels": ("32SC1", camera.score_step),
+            "share": ("32FC1", camera.score_step),
+            "probabilities": ("32FC4", camera.score_step),
+            "projection_overlay": ("bgr8", None),
+            "uncertainty_overlay": ("bgr8", None),
+        }
+        for name, (encoding, step) in sizes.items():
+            messages = first.of("/%s/%s" % (camera.name, name))
+            assert {m.header.stamp.to_nsec() for m in messages} == chosen, name
+            for m in messages:
+                assert m.encoding == encoding
+                assert m.header.frame_id == camera.name
+                if step:
+                    assert (m.width, m.height) == (camera.width // step, camera.height // step)
+        for m in first.of("/%s/superpixels" % camera.name):
+            ids = np.frombuffer(m.data, np.int32)
+            assert np.array_equal(np.unique(ids), np.arange(ids.max() + 1))
+        for m in first.of("/%s/share" % camera.name):
+            share = np.frombuffer(m.data, np.float32)
+            assert share.min() > 0 and share.max() == 1
+
+
+def test_dense_probabilities_equal_those_of_the_points(room):
+    fused = room.fuse("--all", "--set", "overlap=most_central", name="dense.bag")
+    drive, camera = room.drive, room.drive.cameras[0]
+    selection = fused.of("/front/selection")[0].time_ref.to_nsec()
+    message = [
+        m for m in fused.of("/front/probabilities") if m.header.stamp.to_nsec() == selection
+    ][0]
+    dense = np.frombuffer(message.data, np.float32).reshape(message.height, message.width, -1)
+    cloud = fused.clouds()[0]
+    only = cloud["cameras"] == 1
+    world = world_points(drive, cloud, fused.of("/points_semantic")[0].header.stamp.to_nsec())
+    uv, _ = pixels_in(drive, camera, world, selection)
+    pixel = np.floor(uv + 0.5)
+    sure = only & (np.abs(uv + 0.5 - pixel - 0.5) < 0.45).all(axis=1)
+    assert sure.sum() > 100
+    column, row = (pixel[sure] / camera.score_step).astype(int).T
+    ours = np.stack([cloud["p_" + name][sure] for name in CLASS_NAMES], axis=-1)
+    # Both round the same double to float.
+    assert np.abs(ours - dense[row, column]).max() < 1e-6
+
+
+def test_set_overrides_the_rig_file(room):
+    kept = room.fuse("--set", "keep_unlabelled=false", name="kept.bag")
+    for cloud in kept.clouds():
+        assert (cloud["status"] == 0).all()
+    assert "keep_unlabelled" in kept.result.stdout
+
+
+def test_rig_without_cameras(tmp_path):
+    made = Made(tmp_path, Drive(cameras=[], scans=2))
+    fused = made.fuse()
+    assert set(fused.types) == {
+        "/class_info",
+        "/scan_reference",
+        "/points_compensated",
+        "/points_semantic",
+    }
+    for cloud in fused.clouds():
+        assert len(cloud) == made.drive.points_per_scan
+        assert (cloud["status"] == 2).all()
+    for index, reference in enumerate(fused.of("/scan_reference")):
+        assert abs(reference.time_ref.to_nsec() - made.drive.scan_start_ns(index) - 5e7) < 1e6
+
+
+def test_missing_camera_affects_only_itself(tmp_path, fused):
+    made = Made(tmp_path, Drive(images_for=["front"]))
+    other = made.fuse()
+    assert all(m.time_ref.to_nsec() == 0 for m in other.of("/left/selection"))
+    statuses = set()
+    left = made.drive.cameras[1]
+    for message, cloud, whole in zip(other.of("/points_semantic"), other.clouds(), fused.clouds()):
+        alone = whole["cameras"] == 1
+        assert np.array_equal(cloud["label"][alone], whole["label"][alone])
+        # Status 3 is judged with the camera where it was at t_ref.
+        t_ref = message.header.stamp.to_nsec()
+        uv, inside = pixels_in(made.drive, left, world_points(made.drive, cloud, t_ref), t_ref)
+        certain = (margin_to_border(left, uv) > 0.3) & ~np.isin(cloud["status"], (0, 1))
+        assert np.array_equal((cloud["status"] == 3)[certain], inside[certain])
+        statuses |= set(cloud["status"])
+    assert statuses >= {0, 2, 3}
+    assert "/left/image" in other.result.stderr
+
+
+def test_camera_without_camera_info_sees_nothing(tmp_path):
+    made = Made(tmp_path, Drive(scans=1, camera_info_for=["front"]))
+    fused = made.fuse()
+    cloud = fused.clouds()[0]
+    assert set(cloud["cameras"]) == {0, 1}
+    assert set(cloud["status"]) <= {0, 1, 2}
+    assert "/left/camera_info" in fused.result.stderr
+    assert "/front/camera_info" in fused.result.stderr  # the candidate
+
+
+def test_odometry_that_ends_early_marks_firings(tmp_path):
+    # The last scan starts at 0.3 s and lasts to 0.4 s; its t_ref is at 0.35 s.
+    made = Made(tmp_path, Drive(odometry_until_s=0.3601))
+    fused = made.fuse()
+    for index, cloud in enumerate(fused.clouds()):
+        rigid = fused.clouds("/points_compensated")[index]
+        if index < 2:
+            assert (rigid["status"] == 0).all()
+            continue
+        t_ref = fused.of("/points_compensated")[index].header.stamp.to_nsec()
+        late = rigid["dt"] + (t_ref - START_NS) * 1e-9 > 0.36 + 1e-6
+        assert np.array_equal(rigid["status"] == 4, late)
+        assert np.array_equal(cloud["status"] == 4, late)
+        assert late.any() and not late.all()
+    assert "odom" in fused.result.stderr
+
+
+def test_without_odometry_all_points_are_marked(tmp_path):
+    made = Made(tmp_path, Drive(scans=1, odometry="none"))
+    fused = made.fuse()
+    assert (fused.clouds()[0]["status"] == 4).all()
+    points, _, _ = made.drive.scan_points(0)
+    rigid = fused.clouds("/points_compensated")[0]
+    assert np.array_equal(rigid["x"], points[:, 0].astype(np.float32))
+
+
+def test_motion_disabled_needs_no_odometry(tmp_path):
+    made = Made(tmp_path, Drive(scans=1, odometry="none", speed=0.0, yaw_rate=0.0))
+    fused = made.fuse("--set", "motion.enabled=false")
+    check_truth(made.drive, fused, 1e-3, 0.9)
+
+
+def test_odometry_that_misses_an_image_gives_no_image_in_time(tmp_path):
+    # The left camera's image 40 ms after t_ref is not covered.
+    cameras = [
+        Camera("front", 0.0, (1.5, 0.1, 0.2), period_ns=100_000_000, phase_ns=50_000_000),
+        Camera("left", np.pi / 2, (0.8, 0.6, 0.1), period_ns=100_000_000, phase_ns=90_000_000),
+    ]
+    made = Made(tmp_path, Drive(scans=1, cameras=cameras, odometry_until_s=0.1701))
+    fused = made.fuse()
+    assert fused.of("/left/selection")[0].time_ref.to_nsec() == START_NS + 190_000_000
+    cloud = fused.clouds()[0]
+    assert set(cloud["cameras"]) == {0, 1}
+    assert 3 in set(cloud["status"])
+
+
+def test_empty_scan_gives_empty_clouds_with_its_header(tmp_path):
+    made = Made(tmp_path, Drive(empty_scans=(1,)))
+    fused = made.fuse()
+    for topic in ("/points_compensated", "/points_semantic"):
+        messages = fused.of(topic)
+        assert [m.width > 0 for m in messages] == [True, False, True]
+        assert messages[1].header.stamp.to_nsec() == made.drive.scan_start_ns(1)
+        assert messages[1].header.frame_id == "velodyne"
+        assert [f.name for f in messages[1].fields] == [f.name for f in messages[0].fields]
+
+
+def test_one_image_can_serve_two_scans(tmp_path):
+    cameras = [
+        Camera("front", 0.0, (1.5, 0.1, 0.2)),
+        Camera("left", np.pi / 2, (0.8, 0.6, 0.1), period_ns=200_000_000),
+    ]
+    made = Made(tmp_path, Drive(scans=2, cameras=cameras))
+    fused = made.fuse("--all", "--set", "cameras.left.max_time_difference=0.06")
+    chosen = [m.time_ref.to_nsec() for m in fused.of("/left/selection")]
+    assert len(set(chosen)) == 1
+    assert len(fused.of("/left/share")) == 1
+    check_truth(made.drive, fused, 1e-3, 0.9)
+
+
+def test_camera_with_a_clock_of_its_own(tmp_path, fused):
+    cameras = bag_factory.default_cameras()
+    cameras[1].clock_ahead_ns = 30_000_000
+    other = Made(tmp_path, Drive(cameras=cameras)).fuse()
+    for ours, theirs in zip(other.of("/points_semantic"), fused.of("/points_semantic")):
+        assert ours.data == theirs.data
+    for ours, theirs in zip(other.of("/left/selection"), fused.of("/left/selection")):
+        assert ours.time_ref.to_nsec() == theirs.time_ref.to_nsec() + 30_000_000
+
+
+def test_reference_camera_with_a_clock_of_its_own(tmp_path, fused):
+    cameras = bag_factory.default_cameras()
+    cameras[0].clock_ahead_ns = -40_000_000
+    other = Made(tmp_path, Drive(cameras=cameras)).fuse()
+    for ours, theirs in zip(other.of("/points_semantic"), fused.of("/points_semantic")):
+        assert ours.header.stamp == theirs.header.stamp  # true time
+        assert ours.data == theirs.data
+
+
+def test_closest_to_sweep_takes_the_image_of_the_beams(tmp_path):
+    cameras = bag_factory.default_cameras()
+    cameras[1].period_ns = 20_000_000
+    made = Made(tmp_path, Drive(scans=2, cameras=cameras), "image_choice: closest_to_sweep\n")
+    fused = made.fuse()
+    differs = False
+    for index in range(made.drive.scans):
+        points, _, after_ns = made.drive.scan_points(index)
+        t_ref = fused.of("/scan_reference")[index].time_ref.to_nsec()
+        for camera in made.drive.cameras:
+            T = np.linalg.inv(camera.pose()) @ made.drive.lidar_pose
+            uv, _ = camera.project(points @ T[:3, :3].T + T[:3, 3])
+            inside = (uv > -0.5).all(axis=1)
+            inside &= (uv < [camera.width - 0.5, camera.height - 0.5]).all(axis=1)
+            target = made.drive.scan_start_ns(index) + int(after_ns[inside].mean())
+            stamps = made.drive.image_stamps_ns(camera)
+            chosen = fused.of("/%s/selection" % camera.name)[index].time_ref.to_nsec()
+            assert chosen == min(stamps, key=lambda s: (abs(s - target), s))
+            differs |= chosen != min(stamps, key=lambda s: (abs(s - t_ref), s))
+    assert differs
+    check_truth(made.drive, fused, 1e-3, 0.9)
+
+
+def test_ego_mask_never_transfers(room, tmp_path):
+    import cv2
+
+    camera = room.drive.cameras[0]
+    mask = np.full((camera.height, camera.width), 255, np.uint8)
+    mask[:, : camera.width // 2] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    fused = room.fuse("--set", "cameras.front.mask=%s" % (tmp_path / "mask.png"), name="ego.bag")
+    for message in fused.of("/points_semantic"):
+        cloud = read_cloud(message)
+        t_ref = message.header.stamp.to_nsec()  # the stamp of the front image
+        uv, inside = pixels_in(room.drive, camera, world_points(room.drive, cloud, t_ref), t_ref)
+        masked = inside & (uv[:, 0] < camera.width / 2 - 1)
+        free = inside & (uv[:, 0] > camera.width / 2)
+        assert (cloud["cameras"][masked] & 1 == 0).all()
+        assert (cloud["cameras"][free] & 1 == 1).mean() > 0.9
+        assert (cloud["status"][masked & (cloud["cameras"] == 0)] != 0).all()
+    result = room.fuse("--set", "cameras.front.mask=%s" % (tmp_path / "no.png"), expect=1)
+    assert "no.png" in result.stderr
+
+
+def shared(relative):
+    """A file of the optional data; the test is skipped without it."""
+    folder = os.environ.get("SLF_SHARED_DIR")
+    if not folder:
+        here = os.path.dirname(os.path.abspath(__file__))
+        folder = os.path.join(here, "..", "..", "..", "shared")
+    path = os.path.join(folder, relative)
+    if not os.path.exists(path):
+        pytest.skip("optional data not found: " + relative)
+    return path
+
+
+def test_own_network_where_the_bag_has_no_scores(tmp_path):
+    source = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "config")
+    network = shared("models/enet_camvid12_480x360.onnx")
+    with open(os.path.join(source, "models", "enet_camvid12.yaml")) as file:
+        text = file.read().replace("file: enet_camvid12_480x360.onnx", "file: " + network)
+    assert network in text
+    (tmp_path / "enet.yaml").write_text(text)
+    made = Made(tmp_path, Drive(scans=2, semantics="none"))
+    rig = made.rig.read_text()
+    classes = os.path.abspath(os.path.join(source, "classes_camvid12.yaml"))
+    begin, end = rig.index("classes:"), rig.index("cameras:")
+    made.rig.write_text(
+        rig[:begin]
+        + "classes: {file: %s}\n" % classes
+        + rig[end:]
+        + "segmentation: {model: enet.yaml}\n"
+    )
+    fused = made.fuse("--all")
+    again = made.fuse("--all", name="again.bag")
+    assert digest(fused.path) == digest(again.path)
+    for camera in made.drive.cameras:
+        chosen = [m.time_ref.to_nsec() for m in fused.of("/%s/selection" % camera.name)]
+        scores = fused.of("/%s/scores" % camera.name)
+        assert [m.header.stamp.to_nsec() for m in scores] == sorted(set(chosen))
+        assert {m.encoding for m in scores} == {"32FC12"}
+        assert {(m.width, m.height) for m in fused.of("/%s/share" % camera.name)} == {
+            (m.width, m.height) for m in scores
+        }
+    for cloud in fused.clouds():
+        assert (cloud["status"] == 0).any()
+
+
+def test_real_packets_against_another_decoder(tmp_path):
+    from scipy.spatial import cKDTree
+
+    capture = np.load(shared("data/vlp16_packets/nebula_vlp16_scans.npz"))
+    expected_path = shared("data/vlp16_packets/nebula_vlp16_expected_1673400472138016708.pcd")
+    types = bag_factory.velodyne_types()
+    with rosbag.Bag(str(tmp_path / "in.bag"), "w") as bag:
+        for index, scan_stamp in enumerate(capture["scan_stamp"]):
+            scan = types["velodyne_msgs/VelodyneScan"]()
+            scan.header.frame_id = "velodyne"
+            scan.header.stamp = bag_factory.stamp(int(scan_stamp * 1e9))
+            for number in np.flatnonzero(capture["scan"] == index):
+                packet = types["velodyne_msgs/VelodynePacket"]()
+                packet.stamp = bag_factory.stamp(int(capture["packet_stamp"][number] * 1e9))
+                packet.data = capture["packets"][number].tobytes()
+                scan.packets.append(packet)
+            bag.write("/velodyne_packets", scan, scan.header.stamp)
+    (tmp_path / "rig.yaml").write_text("lidar: {input: packets}\nmotion: {enabled: false}\n")
+    result = run(tmp_path / "in.bag", tmp_path / "out.bag", "--rig", tmp_path / "rig.yaml")
+    assert result.returncode == 0, result.stderr
+    clouds = Fused(tmp_path / "out.bag", result).clouds("/points_compensated")
+    assert len(clouds) == len(capture["scan_stamp"])
+    with open(expected_path, "rb") as file:
+        data = file.read()
+    at = data.index(b"DATA binary\n") + len(b"DATA binary\n")
+    kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rest", "V20")]
+    size = int(data[data.index(b"POINTS ") :].split()[1])
+    expected = np.frombuffer(data, np.dtype(kinds), size, at)
+    expected = np.stack([expected[axis] for axis in "xyz"], axis=-1)
+    medians = []
+    for cloud in clouds:
+        ours = np.stack([cloud[axis] for axis in "xyz"], axis=-1)
+        medians.append(np.median(cKDTree(ours).query(expected)[0]))
+    # One of the scans is the other decoder's: coordinates agree to the range unit of 2 mm.
+    assert min(medians) < 2e-3, medians
+
+
+# -- what can go wrong
+
+
+def digest(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def assert_fails(result, *words, code=1):
+    """One line on stderr with all of `words`, and the exit code."""
+    assert result.returncode == code, result.stderr + result.stdout
+    errors = [line for line in result.stderr.splitlines() if "error:" in line]
+    assert len(errors) == 1, result.stderr
+    for word in words:
+        assert word in errors[0]
+
+
+def leftovers(folder):
+    return [name for name in os.listdir(str(folder)) if ".tmp" in name or name == "out.bag"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["in.bag"],
+        ["in.bag", "out.bag"],
+        ["in.bag", "out.bag", "--rig"],
+        ["in.bag", "out.bag", "--rig", "r.yaml", "--nonsense"],
+        ["in.bag", "out.bag", "--rig", "r.yaml", "--all=yes"],
+        ["in.bag", "out.bag", "third.bag", "--rig", "r.yaml"],
+        ["in.bag", "out.bag", "--rig", "r.yaml", "--set", "novalue"],
+        ["in.bag", "out.bag", "--rig", "r.yaml", "-x"],
+    ],
+)
+def test_wrong_command_line(arguments):
+    result = run(*arguments)
+    assert result.returncode == 2
+    assert "--help" in result.stderr
+
+
+def test_help():
+    result = run("--help")
+    assert result.returncode == 0
+    for word in ("--rig", "--set", "--all", "--force", "points_semantic"):
+        assert word in result.stdout
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\0" * 5000, b"#ROSBAG V2.0\n", b"not a bag at all" * 10], ids=repr
+)
+def test_files_that_are_no_bags(room, tmp_path, content):
+    (tmp_path / "bad.bag").write_bytes(content)
+    result = run(tmp_path / "bad.bag", tmp_path / "out.bag", "--rig", room.rig)
+    assert_fails(result, "bad.bag")
+    assert not leftovers(tmp_path)
+
+
+def test_absent_files(room, tmp_path):
+    result = run(tmp_path / "no.bag", tmp_path / "out.bag", "--rig", room.rig)
+    assert_fails(result, "no.bag", "No such file")
+    result = run(room.bag, tmp_path / "out.bag", "--rig", tmp_path / "no.yaml")
+    assert_fails(result, "no.yaml")
+    result = run(room.bag, tmp_path / "no" / "out.bag", "--rig", room.rig)
+    assert_fails(result, "out.bag")
+    result = run(tmp_path, tmp_path / "out.bag", "--rig", room.rig)
+    assert_fails(result, "directory")
+
+
+@pytest.mark.parametrize("part", [0.02, 0.5, 0.9, 0.999])
+def test_truncated_bag(room, tmp_path, part):
+    whole = room.bag.read_bytes()
+    (tmp_path / "short.bag").write_bytes(whole[: int(len(whole) * part)])
+    result = run(tmp_path / "short.bag", tmp_path / "out.bag", "--rig", room.rig)
+    assert_fails(result, "short.bag")
+    assert not leftovers(tmp_path)
+
+
+def test_damaged_bag_ends_with_an_error_or_a_whole_output(room, tmp_path):
+    random = np.random.RandomState(4)
+    whole = bytearray(room.bag.read_bytes())
+    for trial in range(6):
+        data = bytearray(whole)
+        for _ in range(40):
+            data[random.randint(13, len(data))] = random.randint(256)
+        (tmp_path / "bad.bag").write_bytes(bytes(data))
+        out = tmp_path / ("out%d.bag" % trial)
+        result = run(tmp_path / "bad.bag", out, "--rig", room.rig)
+        assert result.returncode in (0, 1), result.stderr
+        if result.returncode == 0:
+            rosbag.Bag(str(out)).close()
+        else:
+            assert not out.exists()
+
+
+def test_unindexed_bag(room, tmp_path):
+    data = bytearray(room.bag.read_bytes())
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    data[at : at + 8] = b"\0" * 8
+    (tmp_path / "open.bag").write_bytes(bytes(data))
+    result = run(tmp_path / "open.bag", tmp_path / "out.bag", "--rig", room.rig)
+    assert_fails(result, "open.bag", "reindex")
+    assert not leftovers(tmp_path)
+
+
+def test_bag_without_messages(room, tmp_path):
+    rosbag.Bag(str(tmp_path / "empty.bag"), "w").close()
+    result = run(tmp_path / "empty.bag", tmp_path / "out.bag", "--rig", room.rig)
+    assert_fails(result, "empty.bag", "no messages")
+
+
+def test_missing_lidar_topic_names_candidates(room, tmp_path):
+    result = run(room.bag, tmp_path / "out.bag", "--rig", room.rig, "--set", "lidar.topic=/cloud")
+    assert_fails(result, "/cloud", "/points")
+    assert not leftovers(tmp_path)
+    result = run(room.bag, tmp_path / "out.bag", "--rig", room.rig, "--set", "lidar.topic=/tf")
+    assert_fails(result, "/tf", "tf2_msgs/TFMessage", "/points")
+
+
+def test_bad_configuration(room, tmp_path):
+    result = run(room.bag, tmp_path / "out.bag", "--rig", room.rig, "--set", "occlusion.mde=off")
+    assert result.returncode == 1
+    assert "mde" in result.stderr
+    assert not leftovers(tmp_path)
+
+
+def test_output_that_exists(room, tmp_path):
+    out = tmp_path / "out.bag"
+    out.write_text("mine")
+    result = run(room.bag, out, "--rig", room.rig)
+    assert_fails(result, "out.bag", "--force")
+    assert out.read_text() == "mine"
+    result = run(room.bag, out, "--rig", room.rig, "--force", "--quiet")
+    assert result.returncode == 0
+    assert (result.stdout, result.stderr) == ("", "")
+    rosbag.Bag(str(out)).close()
+
+
+def test_output_is_the_input(room, tmp_path):
+    before = digest(room.bag)
+    link = tmp_path / "link.bag"
+    os.symlink(str(room.bag), str(link))
+    for out in (room.bag, link):
+        assert_fails(run(room.bag, out, "--rig", room.rig, "--force"), "input")
+    assert digest(room.bag) == before
+
+
+def test_full_disk(room, tmp_path):
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+
+    result = run(room.bag, tmp_path / "out.bag", "--rig", room.rig, preexec_fn=limit)
+    assert_fails(result, "out.bag")
+    assert not leftovers(tmp_path)
+
+
+def test_disk_full_at_the_very_end(room, fused, tmp_path):
+    size = fused.path.stat().st_size
+    for missing in (1, 2000):
+
+        def limit():
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size - missing, size - missing))
+
+        result = run(room.bag, tmp_path / "out.bag", "--rig", room.rig, preexec_fn=limit)
+        assert_fails(result, "out.bag")
+        assert not leftovers(tmp_path)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_leaves_nothing(room, tmp_path, number):
+    arguments = [room.bag, tmp_path / "out.bag", "--rig", room.rig, "--all"]
+    process = subprocess.Popen(
+        [program()] + [str(a) for a in arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    deadline = time.time() + 60
+    while not (tmp_path / "out.bag.tmp").exists():
+        assert process.poll() is None and time.time() < deadline
+        time.sleep(0.001)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + number, errors
+    assert b"interrupted" in errors
+    assert not leftovers(tmp_path)
+
+
+def test_copied_transforms(room):
+    fused = room.fuse("--tf", name="tf.bag")
+    assert len(fused.of("/tf_static")) == 1
+    with rosbag.Bag(str(room.bag)) as bag:
+        originals = [m for _, m, _ in bag.read_messages("/tf")]
+    assert fused.of("/tf") == originals

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: MIT
+"""What the rostests share: launching, playing, receiving, and asking the master who listens.
+
+Every wait is for a condition and bounded; nothing here sleeps for a fixed time to be in step.
+"""
+import contextlib
+import hashlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import xmlrpc.client
+
+import genpy
+import genpy.dynamic
+import rosbag
+import rosgraph
+import rospy
+from diagnostic_msgs.msg import DiagnosticArray
+from rosgraph_msgs.msg import Log
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+SOURCE_DIR = os.path.dirname(os.path.dirname(HERE))
+sys.path.insert(0, os.path.join(SOURCE_DIR, "test", "python"))
+
+import bag_factory  # noqa: E402,F401
+
+MANAGER = "/fusion_manager"
+
+
+def _dynamic(name, text):
+    return genpy.dynamic.generate_dynamic(name, text)[name]
+
+
+class SetBool:
+    """std_srvs/SetBool, whose package need not be installed."""
+
+    _type = "std_srvs/SetBool"
+    _md5sum = "09fb03525b03e7ea1fd3992bafd87e16"
+    _request_class = _dynamic("std_srvs/SetBoolRequest", "bool data\n")
+    _response_class = _dynamic("std_srvs/SetBoolResponse", "bool success\nstring message\n")
+
+
+def wait_until(condition, what, timeout=30.0):
+    """Returns the first true value of `condition()`; fails after `timeout` s."""
+    deadline = time.monotonic() + timeout
+    while True:
+        value = condition()
+        if value:
+            return value
+        if time.monotonic() > deadline:
+            raise AssertionError(
+                "waited %.0f s for %s" % (timeout, what() if callable(what) else what)
+            )
+        time.sleep(0.02)
+
+
+def _stop(process, timeout=20.0):
+    """Ends a process that was started here, as Ctrl-C does."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise AssertionError("%s does not end" % process.args)
+
+
+@contextlib.contextmanager
+def launched(name, **arguments):
+    """A launch file of the package as long as the block runs."""
+    command = ["roslaunch", "--skip-log-check", os.path.join(SOURCE_DIR, "launch", name)]
+    command += ["%s:=%s" % item for item in arguments.items()]
+    process = subprocess.Popen(command)
+    try:
+        yield process
+    finally:
+        _stop(process)
+
+
+@contextlib.contextmanager
+def folder():
+    """A temporary folder."""
+    path = tempfile.mkdtemp(prefix="slf_ros_")
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path)
+
+
+class Made:
+    """A bag of a drive with its rig file, and what fuse_bag makes of it."""
+
+    def __init__(self, path, drive, rig_extra=""):
+        self.drive = drive
+        self.bag = os.path.join(path, "in.bag")
+        self.rig = os.path.join(path, "rig.yaml")
+        bag_factory.write_bag(self.bag, drive)
+        with open(self.rig, "w") as file:
+            file.write(bag_factory.rig_text(drive, rig_extra))
+
+    def fused(self, *overrides):
+        """Semantic clouds of fuse_bag by stamp (ns)."""
+        out = self.bag + ".out"
+        program = os.path.join(os.environ["SLF_BIN_DIR"], "fuse_bag")
+        command = [program, self.bag, out, "--rig", self.rig, "--force", "--quiet"]
+        for override in overrides:
+            command += ["--set", override]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, timeout=60)
+        with rosbag.Bag(out) as bag:
+            return {
+                m.header.stamp.to_nsec(): m for _, m, _ in bag.read_messages(["/points_semantic"])
+            }
+
+    def topics(self):
+        with rosbag.Bag(self.bag) as bag:
+            return set(bag.get_type_and_topic_info().topics)
+
+    def messages(self):
+        """(time in ns, topic, message) in the order of record."""
+        with rosbag.Bag(self.bag) as bag:
+            return [
+                (time.to_nsec(), topic, message) for topic, message, time in bag.read_messages()
+            ]
+
+
+class Received:
+    """The messages of a topic, from now on."""
+
+    def __init__(self, topic, message_type):
+        self.topic = topic
+        self._lock = threading.Lock()
+        self._messages = []
+        self._subscriber = rospy.Subscriber(
+            topic, message_type, self._add, queue_size=1000, buff_size=1 << 24, tcp_nodelay=True
+        )
+
+    def _add(self, message):
+        with self._lock:
+            self._messages.append(message)
+
+    @property
+    def messages(self):
+        with self._lock:
+            return list(self._messages)
+
+    def __len__(self):
+        with self._lock:
+            return len(self._messages)
+
+    def by_stamp(self):
+        return {m.header.stamp.to_nsec(): m for m in self.messages}
+
+    def clear(self):
+        with self._lock:
+            self._messages.clear()
+
+    def wait_for(self, count, timeout=30.0):
+        wait_until(
+            lambda: len(self) >= count,
+            lambda: "%d messages on %s, %d came" % (count, self.topic, len(self)),
+            timeout,
+        )
+        return self.messages
+
+    def close(self):
+        self._subscriber.unregister()
+
+
+def subscribers_of(topic):
+    """Nodes that subscribe to a topic, after the master."""
+    for name, nodes in rosgraph.Master(rospy.get_name()).getSystemState()[1]:
+        if name == topic:
+            return set(nodes)
+    return set()
+
+
+def node_proxy(node):
+    return xmlrpc.client.ServerProxy(rosgraph.Master(rospy.get_name()).lookupNode(node))
+
+
+def pid_of(node):
+    """Process id of a node; None while there is none."""
+    try:
+        return node_proxy(node).getPid(rospy.get_name())[2]
+    except (rosgraph.MasterException, OSError):
+        return None
+
+
+def connections_of(node, direction):
+    """Topics over which `node` has a live connection out ("o") or in ("i")."""
+    try:
+        info = node_proxy(node).getBusInfo(rospy.get_name())[2]
+    except (rosgraph.MasterException, OSError):
+        return set()
+    return {entry[4] for entry in info if entry[2] == direction and (len(entry) < 6 or entry[5])}
+
+
+def wait_for_chain(rig_topics, publisher, timeout=30.0):
+    """Waits until `publisher` is connected to listeners of all these topics."""
+    missing = lambda: set(rig_topics) - connections_of(publisher, "o")  # noqa: E731
+    wait_until(lambda: not missing(), lambda: "listeners of %s" % sorted(missing()), timeout)
+
+
+def resume(player="/player"):
+    """Lets a player that waits at the start of its bag go."""
+    name = player + "/pause_playback"
+    rospy.wait_for_service(name, 20.0)
+    assert rospy.ServiceProxy(name, SetBool)(False).success
+
+
+@contextlib.contextmanager
+def played(bag, *options):
+    """`rosbag play --clock` that waits at the start of the bag for resume()."""
+    command = ["rosbag", "play", "--quiet", "--clock", "--hz=1000", "--delay=0", "--pause"]
+    process = subprocess.Popen(
+        command + list(options) + [bag, "__name:=player"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        _stop(process)
+
+
+def difference(a, b):
+    """What differs between two clouds apart from header.seq, in words; empty = nothing."""
+    if a.header.stamp != b.header.stamp or a.header.frame_id != b.header.frame_id:
+        return "headers differ"
+    for name in ("height", "width", "fields", "is_bigendian", "point_step", "row_step", "is_dense"):
+        # As text: a bag's messages are of generated classes.
+        if str(getattr(a, name)) != str(getattr(b, name)):
+            return "%s differs: %s and %s" % (name, getattr(a, name), getattr(b, name))
+    if a.data == b.data:
+        return ""
+    ours, theirs = bag_factory.read_cloud(a), bag_factory.read_cloud(b)
+    parts = []
+    for name in ours.dtype.names:
+        count = int((ours[name] != theirs[name]).sum())
+        if count:
+            parts.append("%s of %d points" % (name, count))
+    return "data differs: " + (", ".join(parts) or "padding")
+
+
+def digest(data):
+    return hashlib.sha1(bytes(data)).hexdigest()
+
+
+class Diagnostics:
+    """The last /diagnostics of each nodelet: name -> {key: value}, and its level and message."""
+
+    def __init__(self):
+        self.values, self.levels, self.summaries = {}, {}, {}
+        self._subscriber = rospy.Subscriber("/diagnostics", DiagnosticArray, self._add)
+
+    def _add(self, message):
+        for status in message.status:
+            name = status.name.split(":")[0]
+            self.values[name] = {pair.key: pair.value for pair in status.values}
+            level = status.level if isinstance(status.level, int) else ord(status.level)
+            self.levels[name] = level
+            self.summaries.setdefault(name, set()).add((level, status.message))
+
+    def value(self, name, key):
+        return self.values.get(name, {}).get(key)
+
+    def text(self):
+        """All of it, for the log of a test that fails."""
+        lines = []
+        for name, values in sorted(self.values.items()):
+            lines.append(name)
+            lines += ["  %s: %s" % item for item in sorted(values.items())]
+        return "\n".join(lines)
+
+    def close(self):
+        self._subscriber.unregister()
+
+
+class Said:
+    """The lines of /rosout."""
+
+    def __init__(self):
+        self._lock = threading.Lock()
+        self._lines = []
+        self._subscriber = rospy.Subscriber("/rosout", Log, self._add, queue_size=1000)
+
+    def _add(self, message):
+        with self._lock:
+            self._lines.append((message.level, message.name, message.msg))
+
+    def find(self, pattern, level=Log.WARN):
+        """Lines at least as grave as `level` that match."""
+        with self._lock:
+            lines = list(self._lines)
+        return [line for line in lines if line[0] >= level and re.search(pattern, line[2])]
+
+    def wait_for(self, pattern, level=Log.WARN, timeout=20.0):
+        with_text = lambda: "a line like '%s'; said: %s" % (pattern, self._lines)  # noqa: E731
+        return wait_until(lambda: self.find(pattern, level), with_text, timeout)
