@@ -67,9 +67,10 @@ class Rig:
         return tree.get(key, default) if isinstance(tree, dict) else default
 
     @property
-    def camera_names(self) -> List[str]:
+    def cameras(self) -> List[Dict[str, Any]]:
+        """The entries of `cameras`, in the order of their bits."""
         cameras = self._tree.get("cameras") or []
-        return [str(camera.get("name")) for camera in cameras if isinstance(camera, dict)]
+        return [c for c in cameras if isinstance(c, dict) and "name" in c]
 
     def configurations(self) -> List[Configuration]:
         """The columns of Table I: direct, motion, motion_mask; without motion (or mask) in the rig
