@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 #include "fusion_nodelet.h"
 
+#include <nodelet/detail/callback_queue.h>
 #include <ros/master.h>
 
 #include <algorithm>
@@ -68,7 +69,18 @@ void FusionNodelet::stop() {
   gate_->close();
 }
 
+void FusionNodelet::keepQueues() {
+  ros::CallbackQueueInterface* const queues[] = {getNodeHandle().getCallbackQueue(),
+                                                 getMTNodeHandle().getCallbackQueue()};
+  for (int i = 0; i < 2; ++i) {
+    if (auto* queue = dynamic_cast<nodelet::detail::CallbackQueue*>(queues[i])) {
+      kept_queues_[i] = std::shared_ptr<void>(nullptr, [q = queue->shared_from_this()](void*) {});
+    }
+  }
+}
+
 void FusionNodelet::onInit() {
+  keepQueues();
   try {
     rig_ = loadRigFromParameters(getPrivateNodeHandle());
     diagnostics_ = std::make_unique<diagnostic_updater::Updater>(getNodeHandle(),

@@ -153,6 +153,11 @@ class FusionNodelet : public nodelet::Nodelet {
   bool mayReport(const std::string& key);
   void watch();
 
+  void keepQueues();
+
+  /// A callback that runs while the nodelet is unloaded holds it until it returns, and the manager
+  /// has destroyed the queues by then, into which timers and publishers reach as they end.
+  std::shared_ptr<void> kept_queues_[2];
   std::shared_ptr<CallbackGate> gate_ = std::make_shared<CallbackGate>();
   Rig rig_;
   Health health_;

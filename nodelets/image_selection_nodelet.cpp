@@ -213,7 +213,8 @@ class ImageSelectionNodelet : public FusionNodelet {
         return false;
       case StampVerdict::kNewEpoch:
         health().count("clock jumps");
-        NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
+        NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
+                                              << " s: starting anew");
         selector_->reset();
         for (const auto& camera : cameras_) {
           camera->images.clear();

@@ -205,7 +205,8 @@ class ProjectionNodelet : public FusionNodelet {
         camera->semantics.clear();
         camera->images.clear();
       }
-      NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
+      NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
+                                            << " s: starting anew");
     }
     if (verdict == StampVerdict::kStale) {
       health().count("dropped: " + source + " from before a clock jump");

@@ -55,7 +55,7 @@ std::string rigFile(const std::string& folder, const std::string& extra = "") {
                          "cameras: [{name: front, timeout: 10}, {name: left, timeout: 10}]\n"
                          "lidar: {input: points}\n"
                          "reference: {timeout: 10}\n"
-                         "superpixels: {count: 20}\n"
+                         "superpixels: {count: 20}\nocclusion: {mode: 'off'}\n"
                       << extra;
   return path;
 }
@@ -232,22 +232,28 @@ TEST(ZeroCopy, MessagesPassByPointerAndAreNotChanged) {
       boost::function<void(const diagnostic_msgs::DiagnosticArrayConstPtr&)>(
           [&keys](const diagnostic_msgs::DiagnosticArrayConstPtr& array) {
             for (const auto& status : array->status) {
-              for (const auto& value : status.values) keys[status.name].insert(value.key);
+              for (const auto& value : status.values) {
+                keys[status.name].insert(value.key);
+                keys[status.name].insert(value.key + " = " + value.value);
+              }
             }
           }));
   const auto reads = [&keys](const std::string& nodelet, const std::string& topic) {
     for (const auto& [name, known] : keys) {
-      if (name.find(nodelet) != std::string::npos &&
-          known.count("input /zero_copy/" + topic + " messages") > 0) {
+      if (name.find(nodelet) != std::string::npos && known.count("input /zero_copy/" + topic) > 0) {
         return true;
       }
     }
     return false;
   };
   ASSERT_TRUE(waitFor([&] {
-    return reads("ImageSelection", "points") && reads("MotionCompensation", "points") &&
-           reads("SuperpixelUncertainty", "left/image_selected") &&
-           reads("Projection", "points_compensated") && reads("Projection", "left/share");
+    return reads("ImageSelection", "points messages") &&
+           reads("MotionCompensation", "points messages") &&
+           reads("SuperpixelUncertainty", "left/image_selected messages") &&
+           reads("Projection", "points_compensated messages") &&
+           reads("Projection", "left/share messages") &&
+           reads("Projection", "front/camera_info messages = 1") &&
+           reads("Projection", "left/camera_info messages = 1");
   }));
 
   Witness witness;

@@ -109,8 +109,9 @@ class Trouble(unittest.TestCase):
             self.assertTrue((cloud["status"][only_front] == 0).all())
             only_left = whole["cameras"] == 2
             self.assertGreater(only_left.sum(), 100)
-            # In the other camera's image a point can be hidden; else it waits in vain.
-            self.assertLessEqual(set(cloud["status"][only_left]), {1, 3})
+            # A point can be hidden in the other camera's image, or leave this one's when the
+            # vehicle's motion to the image is left out; all others wait in vain.
+            self.assertLessEqual(set(cloud["status"][only_left]), {1, 2, 3})
             self.assertGreater((cloud["status"][only_left] == 3).sum(), 100)
         live.wait_until(
             lambda: any(
