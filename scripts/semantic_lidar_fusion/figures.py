@@ -339,9 +339,12 @@ def draw_score_maps(path: str, view: View, labels: LabelSet) -> None:
     aspect = source[0] / source[1]
     width = 7.2 / columns
     # One row of headings between and above the halves.
-    height = (width * aspect + 0.2) * rows * 2 + 0.6
+    height = (width * aspect + 0.2) * rows * 2 + 0.9
     figure = plt.figure(figsize=(7.2, height))
-    halves = figure.add_gridspec(2, 1, hspace=0.11, left=0.01, right=0.94, top=0.97, bottom=0.01)
+    half_height = (width * aspect + 0.2) * rows
+    halves = figure.add_gridspec(
+        2, 1, hspace=0.5 / half_height, left=0.01, right=0.94, top=1 - 0.4 / height, bottom=0.0
+    )
     low, high = np.percentile(view.scores, (0.5, 99.9))
     for half, (values, name, limits) in enumerate(
         (
@@ -349,7 +352,7 @@ def draw_score_maps(path: str, view: View, labels: LabelSet) -> None:
             (view.probabilities, "(b) probabilities after superpixel softmax", (0.0, 1.0)),
         )
     ):
-        grid = halves[half].subgridspec(rows, columns, wspace=0.04, hspace=0.2)
+        grid = halves[half].subgridspec(rows, columns, wspace=0.04, hspace=0.2 / (width * aspect))
         axes = []
         for index in range(count):
             axis = figure.add_subplot(grid[index // columns, index % columns])
@@ -368,7 +371,7 @@ def draw_score_maps(path: str, view: View, labels: LabelSet) -> None:
         scale = figure.add_axes([0.95, bottom.y0, 0.012, top.y1 - bottom.y0])
         bar = figure.colorbar(drawn, cax=scale)
         bar.ax.tick_params(labelsize=7)
-        figure.text(0.475, top.y1 + 0.22 / height, name, ha="center", va="bottom", fontsize=9)
+        figure.text(0.475, top.y1 + 0.19 / height, name, ha="center", va="bottom", fontsize=9)
     plotting.save(figure, path)
 
 
@@ -435,10 +438,10 @@ def draw_projection(path: str, scene: Scene) -> None:
                     got.pixel[got.removed, 1],
                     c="magenta",
                     marker="x",
-                    s=max(3.0, 2.5 * size),
-                    linewidths=0.5,
+                    s=max(2.0, 2.0 * size),
+                    linewidths=0.35,
                 )
-                text = "%s, with mask: %d of %d points removed" % (
+                text = "%s, masked: %d of %d removed" % (
                     view.name,
                     got.removed.sum(),
                     len(got.depth),
@@ -447,7 +450,7 @@ def draw_projection(path: str, scene: Scene) -> None:
                 text = "%s, direct" % view.name
             axis.set_xlim(-0.5, view.image.shape[1] - 0.5)
             axis.set_ylim(view.image.shape[0] - 0.5, -0.5)
-            axis.set_xlabel(text, labelpad=2)
+            axis.set_xlabel(text, labelpad=2, fontsize=8)
             _bare(axis)
     scalar = plt.cm.ScalarMappable(norm=norm, cmap="jet_r")
     total = figure.get_size_inches()[1]
@@ -473,11 +476,11 @@ def draw_projection(path: str, scene: Scene) -> None:
 
 
 def panorama(
-    scene: Scene, width: int = 2400, elevation_deg: Tuple[float, float] = (-35.0, 30.0)
+    scene: Scene, columns: int = 2000, elevation_deg: Tuple[float, float] = (-35.0, 30.0)
 ) -> Optional[Tuple[np.ndarray, np.ndarray, List[float]]]:
     """The segmented images on a cylinder of 10 m around the vehicle's cameras.
 
-    Returns the picture (h, w, 3) uint8, whether a camera sees each pixel (h, w) bool, and the extent
+    About `columns` pixels wide. Returns the picture (h, w, 3) uint8, whether a camera sees each pixel (h, w) bool, and the extent
     [left, right, bottom, top] in deg (azimuth to the left is positive), cut to what is seen. Of
     several cameras the one that sees a direction nearest to its axis gives the pixel."""
     views = [
@@ -487,6 +490,17 @@ def panorama(
     ]
     if not views:
         return None
+    coarse = _panorama(scene, views, 720, elevation_deg)
+    if coarse is None:
+        return None
+    left, right = coarse[2][:2]
+    return _panorama(scene, views, int(columns * 360.0 / (left - right)), elevation_deg)
+
+
+def _panorama(
+    scene: Scene, views: List[View], width: int, elevation_deg: Tuple[float, float]
+) -> Optional[Tuple[np.ndarray, np.ndarray, List[float]]]:
+    """`width`: pixels of 360 deg."""
     middle = np.mean([v.to_vehicle[:3, 3] for v in views], axis=0)
     step = 360.0 / width
     azimuth = np.deg2rad(180.0 - (np.arange(width) + 0.5) * step)
@@ -549,13 +563,13 @@ def draw_top_views(path: str, scene: Scene) -> None:
     fused = cloud.fused
     xyz = cloud.xyz
     merged = cloud.probabilities[fused].astype(np.float64) @ scene.labels.merge_matrix()
-    reach = np.percentile(np.abs(xyz[fused, :2]).max(axis=1), 97) if fused.any() else 20.0
+    reach = np.percentile(np.abs(xyz[fused, :2]).max(axis=1), 92) if fused.any() else 20.0
     reach = float(np.clip(np.ceil(reach / 5) * 5, 10.0, _TOP_VIEW_M))
     # Leave away the empty side of a rig that looks one way only.
     x, y = xyz[fused, 0], xyz[fused, 1]
     bounds = []
     for values in (x, y):
-        low, high = np.percentile(values, (1, 99)) if len(values) else (-reach, reach)
+        low, high = np.percentile(values, (4, 96)) if len(values) else (-reach, reach)
         bounds.append((max(-reach, min(low, -3.0) - 2.0), min(reach, max(high, 3.0) + 2.0)))
     (low_x, high_x), (low_y, high_y) = bounds
     # Wider than high fills the page: lay the longer side across it.
@@ -622,9 +636,9 @@ def draw_top_views(path: str, scene: Scene) -> None:
 
 
 def _scale_bar(axis: Any) -> None:
-    """10 m in the lower left corner."""
+    """10 m in the upper left corner."""
     (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
-    x, y = left + 0.05 * (right - left), bottom + 0.08 * (top - bottom)
+    x, y = left + 0.05 * (right - left), bottom + 0.86 * (top - bottom)
     axis.plot([x, x + 10], [y, y], color="black", linewidth=1.2)
     axis.text(x + 5, y + 0.03 * (top - bottom), "10 m", ha="center", va="bottom", fontsize=7)
 
