@@ -333,7 +333,7 @@ def draw_score_maps(path: str, view: View, labels: LabelSet) -> None:
     """Figure 3: the network's scores of each class (upper half), and P after it (lower half)."""
     plt = plotting.pyplot()
     count = len(labels)
-    columns = 6 if count <= 12 else 7 if count <= 14 else 5
+    columns = min(count, 6 if count <= 12 else 7 if count <= 14 else 5)
     rows = -(-count // columns)
     source = view.image.shape if view.image is not None else view.probabilities.shape
     aspect = source[0] / source[1]
@@ -410,7 +410,7 @@ def draw_projection(path: str, scene: Scene) -> None:
         2,
         figsize=(2 * width, sum(heights) + 0.25 * len(views) + 0.55),
         squeeze=False,
-        gridspec_kw={"height_ratios": heights, "wspace": 0.02, "hspace": 0.12},
+        gridspec_kw={"height_ratios": heights, "wspace": 0.02, "hspace": 0.24 / np.mean(heights)},
     )
     norm = LogNorm(2.0, 60.0)
     for row, view in zip(axes, views):
@@ -557,7 +557,7 @@ def draw_top_views(path: str, scene: Scene) -> None:
     rows_of = scene.labels.evaluation_classes()
     got = panorama(scene)
     count = len(rows_of)
-    columns = 3 if count <= 6 else 4
+    columns = 3 if count in (3, 5, 6, 9) else min(count, 4)
     rows = -(-count // columns)
     cloud = scene.cloud
     fused = cloud.fused
