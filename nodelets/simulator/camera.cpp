@@ -42,7 +42,8 @@ Vector3f skyColor(const Vector3f& way) {
            smoothStep(0.02F, 0.15F, way.z());
   }
   const float glare = std::max(way.dot(kSunDirection), 0.0F);
-  sky += Vector3f(1.0F, 0.93F, 0.8F) * (0.35F * std::pow(glare, 24.0F) + 6.0F * std::pow(glare, 1800.0F));
+  sky += Vector3f(1.0F, 0.93F, 0.8F) *
+         (0.35F * std::pow(glare, 24.0F) + 6.0F * std::pow(glare, 1800.0F));
   return sky;
 }
 
@@ -60,10 +61,10 @@ float bond(float along, float up, float length, float height, float joint, float
 
 struct Surface {
   Vector3f albedo;
-  float gloss = 0.0F;     ///< of a mirror for the sky
-  float shine = 0.0F;     ///< of the sun's highlight
-  float glow = 0.0F;      ///< own light
-  bool thin = false;      ///< lets light through from behind
+  float gloss = 0.0F;  ///< of a mirror for the sky
+  float shine = 0.0F;  ///< of the sun's highlight
+  float glow = 0.0F;   ///< own light
+  bool thin = false;   ///< lets light through from behind
 };
 
 /// `p`: object coordinates, `n`: normal in object coordinates, `uv`: texture.
@@ -106,7 +107,8 @@ Surface surfaceOf(Material material, const Vector3f& tint, const Vector3f& p, co
     }
     case Material::kKerb: {
       const float joint = fraction(uv.x()) < 0.02F ? 0.6F : 1.0F;
-      s.albedo = Vector3f::Constant(joint * (0.55F + 0.12F * (smoothNoise(7.0F * uv.x(), 7.0F * uv.y(), 14) - 0.5F)));
+      s.albedo = Vector3f::Constant(
+          joint * (0.55F + 0.12F * (smoothNoise(7.0F * uv.x(), 7.0F * uv.y(), 14) - 0.5F)));
       break;
     }
     case Material::kGrass: {
@@ -176,7 +178,8 @@ Surface surfaceOf(Material material, const Vector3f& tint, const Vector3f& p, co
       s.shine = 0.3F;
       break;
     case Material::kConcrete:
-      s.albedo = Vector3f::Constant(0.6F + 0.15F * (smoothNoise(5.0F * p.x(), 5.0F * (p.y() + p.z()), 25) - 0.5F));
+      s.albedo = Vector3f::Constant(
+          0.6F + 0.15F * (smoothNoise(5.0F * p.x(), 5.0F * (p.y() + p.z()), 25) - 0.5F));
       break;
     case Material::kBark: {
       const float ridge = smoothNoise(30.0F * (p.x() + p.y()), 5.0F * p.z(), 26);
@@ -184,8 +187,9 @@ Surface surfaceOf(Material material, const Vector3f& tint, const Vector3f& p, co
       break;
     }
     case Material::kLeaf: {
-      const float kind = latticeNoise(static_cast<int>(std::floor(7.0F * p.x())),
-                                      static_cast<int>(std::floor(7.0F * (p.y() + 2.0F * p.z()))), 27);
+      const float kind =
+          latticeNoise(static_cast<int>(std::floor(7.0F * p.x())),
+                       static_cast<int>(std::floor(7.0F * (p.y() + 2.0F * p.z()))), 27);
       s.albedo = tint * (0.7F + 0.7F * kind);
       s.thin = true;
       s.shine = 0.08F;
@@ -282,13 +286,15 @@ Sample look(const World& world, const Vector3f& origin, const Vector3f& way) {
   const float up = 0.5F + 0.5F * n.z();
   // What stands near the ground sees less of the sky.
   const float open = 0.72F + 0.28F * smoothStep(0.0F, 2.5F, p.z());
-  const Vector3f ambient = (kGroundLight + (kSkyLight - kGroundLight) * up) * (n.z() > 0.9F ? 1.0F : open);
+  const Vector3f ambient =
+      (kGroundLight + (kSkyLight - kGroundLight) * up) * (n.z() > 0.9F ? 1.0F : open);
   Vector3f light = surface.albedo.cwiseProduct(ambient + kSunLight * sun);
   const Vector3f mirrored = way - 2.0F * way.dot(n) * n;
   if (surface.gloss > 0.0F) {
     const float grazing = std::pow(1.0F - std::abs(way.dot(n)), 4.0F);
     const float share = surface.gloss + (1.0F - surface.gloss) * 0.6F * grazing;
-    const Vector3f around = mirrored.z() > 0.05F ? Vector3f(0.75F * skyColor(mirrored)) : Vector3f(0.2F, 0.19F, 0.18F);
+    const Vector3f around =
+        mirrored.z() > 0.05F ? Vector3f(0.75F * skyColor(mirrored)) : Vector3f(0.2F, 0.19F, 0.18F);
     light = light * (1.0F - share) + around * share;
   }
   if (surface.shine > 0.0F && sun > 0.0F) {
@@ -313,7 +319,8 @@ void forEachRow(int rows, int threads, const Work& work) {
   std::atomic<int> next{0};
   const auto loop = [&] {
     constexpr int kRowsAtOnce = 8;
-    for (int first = next.fetch_add(kRowsAtOnce); first < rows; first = next.fetch_add(kRowsAtOnce)) {
+    for (int first = next.fetch_add(kRowsAtOnce); first < rows;
+         first = next.fetch_add(kRowsAtOnce)) {
       for (int row = first; row < std::min(rows, first + kRowsAtOnce); ++row) work(row);
     }
   };
@@ -327,7 +334,8 @@ void forEachRow(int rows, int threads, const Work& work) {
 
 Camera::Camera(const CameraInfo& info, const Transform& T_base_camera)
     : info_(info), model_(info, {}), T_base_camera_(T_base_camera) {
-  rays_.reserve(static_cast<std::size_t>(info.size.width) * static_cast<std::size_t>(info.size.height));
+  rays_.reserve(static_cast<std::size_t>(info.size.width) *
+                static_cast<std::size_t>(info.size.height));
   for (int row = 0; row < info.size.height; ++row) {
     for (int column = 0; column < info.size.width; ++column) {
       const std::optional<Eigen::Vector3d> ray = model_.ray({column, row});
@@ -344,12 +352,14 @@ Picture Camera::render(const World& world, const Transform& T_world_base, std::u
   const Eigen::Matrix3f R = T_world_camera.linear();
   const int width = info_.size.width, height = info_.size.height;
   const auto rayOf = [&](int row, int column) {
-    return rays_[static_cast<std::size_t>(row) * static_cast<std::size_t>(width) + static_cast<std::size_t>(column)];
+    return rays_[static_cast<std::size_t>(row) * static_cast<std::size_t>(width) +
+                 static_cast<std::size_t>(column)];
   };
   std::vector<Sample> samples(rays_.size());
   forEachRow(height, threads, [&](int row) {
     for (int column = 0; column < width; ++column) {
-      samples[static_cast<std::size_t>(row) * width + column] = look(world, origin, R * rayOf(row, column));
+      samples[static_cast<std::size_t>(row) * width + column] =
+          look(world, origin, R * rayOf(row, column));
     }
   });
   Picture picture{cv::Mat(height, width, CV_8UC3), cv::Mat(height, width, CV_8UC1)};
@@ -371,11 +381,14 @@ Picture Camera::render(const World& world, const Transform& T_world_base, std::u
                (other.light - light).squaredNorm() > 0.02F;
       }
       if (edge) {
-        const Vector3f right = rayOf(row, std::min(column + 1, width - 1)) - rayOf(row, std::min(column + 1, width - 1) - 1);
-        const Vector3f down = rayOf(std::min(row + 1, height - 1), column) - rayOf(std::min(row + 1, height - 1) - 1, column);
+        const Vector3f right = rayOf(row, std::min(column + 1, width - 1)) -
+                               rayOf(row, std::min(column + 1, width - 1) - 1);
+        const Vector3f down = rayOf(std::min(row + 1, height - 1), column) -
+                              rayOf(std::min(row + 1, height - 1) - 1, column);
         const float offsets[3][2] = {{0.33F, -0.17F}, {-0.33F, 0.17F}, {0.17F, 0.40F}};
         for (const auto& offset : offsets) {
-          const Vector3f way = (rayOf(row, column) + offset[0] * right + offset[1] * down).normalized();
+          const Vector3f way =
+              (rayOf(row, column) + offset[0] * right + offset[1] * down).normalized();
           light += look(world, origin, R * way).light;
         }
         light *= 0.25F;
@@ -383,7 +396,8 @@ Picture Camera::render(const World& world, const Transform& T_world_base, std::u
       const float x = (static_cast<float>(column) - cx) / static_cast<float>(width);
       const float y = (static_cast<float>(row) - cy) / static_cast<float>(width);
       light *= 1.0F - 0.55F * (x * x + y * y);
-      Random random(mixKeys(key, static_cast<std::uint64_t>(row), static_cast<std::uint64_t>(column)));
+      Random random(
+          mixKeys(key, static_cast<std::uint64_t>(row), static_cast<std::uint64_t>(column)));
       const float grain = static_cast<float>(random.uniform() + random.uniform() - 1.0) * 4.0F;
       for (int channel = 0; channel < 3; ++channel) {
         const float value = 255.0F * toneMapped(light[2 - channel]) + grain +
@@ -398,8 +412,7 @@ Picture Camera::render(const World& world, const Transform& T_world_base, std::u
 
 cv::Mat distanceToClassEdge(const cv::Mat& labels) {
   // Class by class: how far is the nearest pixel of another class?
-  cv::Mat result(labels.size(), CV_32FC1,
-                 cv::Scalar(std::hypot(labels.cols, labels.rows)));
+  cv::Mat result(labels.size(), CV_32FC1, cv::Scalar(std::hypot(labels.cols, labels.rows)));
   for (int kind = 0; kind < kClassCount; ++kind) {
     const cv::Mat inside = labels == kind;
     const int count = cv::countNonZero(inside);

@@ -14,9 +14,9 @@ constexpr double kLongestCycleS = 10.0;
 // Parts of a cycle.
 constexpr double kBrakeBegin = 0.30, kBrakeEnd = 0.55, kRiseBegin = 0.80;
 constexpr double kTurnBegin = 0.50, kTurnEnd = 0.98;
-constexpr double kMostBraking = 3.5;     // m/s^2
-constexpr double kMostLateral = 3.0;     // m/s^2
-constexpr double kMostTurnRate = 0.45;   // rad/s
+constexpr double kMostBraking = 3.5;    // m/s^2
+constexpr double kMostLateral = 3.0;    // m/s^2
+constexpr double kMostTurnRate = 0.45;  // rad/s
 constexpr double kLeastRadiusM = 20.0;  // the houses of a bend's inside need room
 constexpr double kMostTurn = 60.0 * kPi / 180.0;
 // Angles per acceleration of a soft car, rad / (m/s^2).
@@ -33,8 +33,8 @@ DrivePath::DrivePath(double duration_s, double speed_mps)
   drop_mps_ = std::min(0.45 * speed_mps, kMostBraking * brake_s * 2.0 / kPi);
   const double turn_s = (kTurnEnd - kTurnBegin) * cycle_s_;
   const double slow_mps = speed_mps - drop_mps_;
-  turn_rate_ = std::min({kMostLateral / slow_mps, kMostTurnRate, slow_mps / kLeastRadiusM,
-                         2.0 * kMostTurn / turn_s});
+  turn_rate_ = std::min(
+      {kMostLateral / slow_mps, kMostTurnRate, slow_mps / kLeastRadiusM, 2.0 * kMostTurn / turn_s});
   const int steps = static_cast<int>(std::lround((duration_s + 2.0 * kMarginS) / kStepS));
   table_.resize(static_cast<std::size_t>(steps) + 1);
   PathPoint point;
@@ -46,10 +46,10 @@ DrivePath::DrivePath(double duration_s, double speed_mps)
     const double v[3] = {speed(t), speed(t + 0.5 * kStepS), speed(t + kStepS)};
     const double h[3] = {heading(t), heading(t + 0.5 * kStepS), heading(t + kStepS)};
     const double weight = kStepS / 6.0;
-    point.x += weight * (v[0] * std::cos(h[0]) + 4.0 * v[1] * std::cos(h[1]) +
-                         v[2] * std::cos(h[2]));
-    point.y += weight * (v[0] * std::sin(h[0]) + 4.0 * v[1] * std::sin(h[1]) +
-                         v[2] * std::sin(h[2]));
+    point.x +=
+        weight * (v[0] * std::cos(h[0]) + 4.0 * v[1] * std::cos(h[1]) + v[2] * std::cos(h[2]));
+    point.y +=
+        weight * (v[0] * std::sin(h[0]) + 4.0 * v[1] * std::sin(h[1]) + v[2] * std::sin(h[2]));
     point.distance += weight * (v[0] + 4.0 * v[1] + v[2]);
     point.heading = h[2];
     table_[static_cast<std::size_t>(i) + 1] = point;
@@ -106,8 +106,8 @@ double DrivePath::heading(double time_s) const {
   // Bends to the left and to the right cancel in pairs.
   const bool odd = std::fmod(cycle, 2.0) != 0.0;
   const double whole = 0.5 * turn_rate_ * turn_s;
-  const double w = std::min(
-      std::max((t / cycle_s_ - cycle - kTurnBegin) / (kTurnEnd - kTurnBegin), 0.0), 1.0);
+  const double w =
+      std::min(std::max((t / cycle_s_ - cycle - kTurnBegin) / (kTurnEnd - kTurnBegin), 0.0), 1.0);
   const double part = turn_rate_ * turn_s * (0.5 * w - std::sin(2.0 * kPi * w) / (4.0 * kPi));
   return odd ? whole - part : part;
 }
@@ -125,8 +125,10 @@ PathPoint DrivePath::at(double time_s) const {
   const double h00 = (1.0 + 2.0 * w) * (1.0 - w) * (1.0 - w), h01 = w * w * (3.0 - 2.0 * w);
   const double h10 = w * (1.0 - w) * (1.0 - w), h11 = w * w * (w - 1.0);
   PathPoint result;
-  result.x = h00 * a.x + h01 * b.x + h10 * va * std::cos(a.heading) + h11 * vb * std::cos(b.heading);
-  result.y = h00 * a.y + h01 * b.y + h10 * va * std::sin(a.heading) + h11 * vb * std::sin(b.heading);
+  result.x =
+      h00 * a.x + h01 * b.x + h10 * va * std::cos(a.heading) + h11 * vb * std::cos(b.heading);
+  result.y =
+      h00 * a.y + h01 * b.y + h10 * va * std::sin(a.heading) + h11 * vb * std::sin(b.heading);
   result.distance = h00 * a.distance + h01 * b.distance + h10 * va + h11 * vb;
   result.heading = heading(time_s);
   return result;

@@ -60,9 +60,9 @@ Mesh makeCar(const std::vector<Station>& stations, float wheel_x_front, float wh
   Mesh mesh;
   const auto corners = [](const Station& s) {
     return std::array<Vector3f, 8>{
-        Vector3f(s.x, s.belt_half - 0.08F, s.sill), Vector3f(s.x, s.belt_half, s.sill + 0.25F),
-        Vector3f(s.x, s.belt_half - 0.02F, s.belt), Vector3f(s.x, s.roof_half, s.roof),
-        Vector3f(s.x, -s.roof_half, s.roof), Vector3f(s.x, -s.belt_half + 0.02F, s.belt),
+        Vector3f(s.x, s.belt_half - 0.08F, s.sill),  Vector3f(s.x, s.belt_half, s.sill + 0.25F),
+        Vector3f(s.x, s.belt_half - 0.02F, s.belt),  Vector3f(s.x, s.roof_half, s.roof),
+        Vector3f(s.x, -s.roof_half, s.roof),         Vector3f(s.x, -s.belt_half + 0.02F, s.belt),
         Vector3f(s.x, -s.belt_half, s.sill + 0.25F), Vector3f(s.x, -s.belt_half + 0.08F, s.sill)};
   };
   const auto tall = [](const Station& s) { return s.roof > s.belt + 0.25F; };
@@ -84,7 +84,8 @@ Mesh makeCar(const std::vector<Station>& stations, float wheel_x_front, float wh
     if (tall(a) && tall(b)) {
       for (const int sign : {1, -1}) {
         const float s = static_cast<float>(sign);
-        const Vector3f low(b.x, s * b.belt_half, b.belt), high(b.x, s * (b.roof_half + 0.02F), b.roof);
+        const Vector3f low(b.x, s * b.belt_half, b.belt),
+            high(b.x, s * (b.roof_half + 0.02F), b.roof);
         const Vector3f wide(0.05F, 0.0F, 0.0F);
         mesh.quad(low - wide, low + wide, high + wide, high - wide, Class::kVehicle,
                   Material::kPaint);
@@ -102,11 +103,12 @@ Mesh makeCar(const std::vector<Station>& stations, float wheel_x_front, float wh
     const float z = stations[end].sill + 0.32F, half = stations[end].belt_half;
     for (const float s : {1.0F, -1.0F}) {
       const float y = s * (half - 0.28F);
-      mesh.box(Vector3f(std::min(x, x + out), y - 0.2F, z), Vector3f(std::max(x, x + out), y + 0.2F, z + 0.16F),
-               Class::kVehicle, front ? Material::kHeadlight : Material::kTaillight);
+      mesh.box(Vector3f(std::min(x, x + out), y - 0.2F, z),
+               Vector3f(std::max(x, x + out), y + 0.2F, z + 0.16F), Class::kVehicle,
+               front ? Material::kHeadlight : Material::kTaillight);
     }
-    mesh.box(Vector3f(std::min(x, x + out), -0.22F, z - 0.2F), Vector3f(std::max(x, x + out), 0.22F, z - 0.08F),
-             Class::kVehicle, Material::kFrame);
+    mesh.box(Vector3f(std::min(x, x + out), -0.22F, z - 0.2F),
+             Vector3f(std::max(x, x + out), 0.22F, z - 0.08F), Class::kVehicle, Material::kFrame);
   }
   for (const float x : {wheel_x_front, wheel_x_rear}) {
     for (const float s : {1.0F, -1.0F}) {
@@ -188,11 +190,15 @@ Mesh makeTree(Random random, double height, double crown, int leaves) {
     const Vector3f at = lumps[lump] + sizes[lump] * way;
     const Vector3f normal =
         (way + Vector3f(static_cast<float>(random.normal()), static_cast<float>(random.normal()),
-                        static_cast<float>(random.normal() + 0.6)) * 0.6F).normalized();
+                        static_cast<float>(random.normal() + 0.6)) *
+                   0.6F)
+            .normalized();
     const Vector3f p = normal.unitOrthogonal(), q = normal.cross(p);
     const float size = static_cast<float>(random.uniform(0.07, 0.15));
-    const Vector3f along = size * (std::cos(static_cast<float>(i)) * p + std::sin(static_cast<float>(i)) * q);
-    const Vector3f aside = 0.55F * size * (std::cos(static_cast<float>(i)) * q - std::sin(static_cast<float>(i)) * p);
+    const Vector3f along =
+        size * (std::cos(static_cast<float>(i)) * p + std::sin(static_cast<float>(i)) * q);
+    const Vector3f aside =
+        0.55F * size * (std::cos(static_cast<float>(i)) * q - std::sin(static_cast<float>(i)) * p);
     mesh.quad(at - along, at + aside, at + along, at - aside, Class::kVegetation, Material::kLeaf);
   }
   return mesh;
@@ -200,16 +206,21 @@ Mesh makeTree(Random random, double height, double crown, int leaves) {
 
 Mesh makeHedge(Random random, float length) {
   Mesh mesh;
-  mesh.box(Vector3f(0.05F, -0.22F, 0.0F), Vector3f(length - 0.05F, 0.22F, 0.95F), Class::kVegetation,
-           Material::kLeaf);
+  mesh.box(Vector3f(0.05F, -0.22F, 0.0F), Vector3f(length - 0.05F, 0.22F, 0.95F),
+           Class::kVegetation, Material::kLeaf);
   const int leaves = static_cast<int>(260.0F * length);
   for (int i = 0; i < leaves; ++i) {
     const float x = static_cast<float>(random.uniform(0.0, length));
     const int side = static_cast<int>(random.uniform() * 3.0);
-    const float y = side == 2 ? static_cast<float>(random.uniform(-0.28, 0.28)) : (side == 0 ? -0.25F : 0.25F);
+    const float y =
+        side == 2 ? static_cast<float>(random.uniform(-0.28, 0.28)) : (side == 0 ? -0.25F : 0.25F);
     const float z = side == 2 ? 0.98F : static_cast<float>(random.uniform(0.05, 1.0));
-    const Vector3f at(x, y + static_cast<float>(0.03 * random.normal()), z + static_cast<float>(0.02 * random.normal()));
-    const Vector3f normal = Vector3f(static_cast<float>(random.normal()), static_cast<float>(random.normal()), static_cast<float>(random.normal())).normalized();
+    const Vector3f at(x, y + static_cast<float>(0.03 * random.normal()),
+                      z + static_cast<float>(0.02 * random.normal()));
+    const Vector3f normal =
+        Vector3f(static_cast<float>(random.normal()), static_cast<float>(random.normal()),
+                 static_cast<float>(random.normal()))
+            .normalized();
     const Vector3f p = 0.07F * normal.unitOrthogonal(), q = 0.6F * normal.cross(p);
     mesh.quad(at - p, at + q, at + p, at - q, Class::kVegetation, Material::kLeaf);
   }
@@ -256,17 +267,22 @@ Mesh makeHouse(Random random, float width, int storeys, Material wall, bool pitc
   }
   wallPiece(0, width, storey * static_cast<float>(storeys), height);
   mesh.quad({0, 0, 0}, {0, depth, 0}, {0, depth, height}, {0, 0, height}, kind, wall);
-  mesh.quad({width, 0, 0}, {width, depth, 0}, {width, depth, height}, {width, 0, height}, kind, wall);
-  mesh.quad({0, depth, 0}, {width, depth, 0}, {width, depth, height}, {0, depth, height}, kind, wall);
+  mesh.quad({width, 0, 0}, {width, depth, 0}, {width, depth, height}, {width, 0, height}, kind,
+            wall);
+  mesh.quad({0, depth, 0}, {width, depth, 0}, {width, depth, height}, {0, depth, height}, kind,
+            wall);
   if (pitched_roof) {
     const float ridge = height + 2.4F;
     const float over = 0.35F;
     mesh.quad({-over, -over, height}, {width + over, -over, height},
-              {width + over, 0.5F * depth, ridge}, {-over, 0.5F * depth, ridge}, kind, Material::kRoof);
+              {width + over, 0.5F * depth, ridge}, {-over, 0.5F * depth, ridge}, kind,
+              Material::kRoof);
     mesh.quad({-over, depth + over, height}, {width + over, depth + over, height},
-              {width + over, 0.5F * depth, ridge}, {-over, 0.5F * depth, ridge}, kind, Material::kRoof);
+              {width + over, 0.5F * depth, ridge}, {-over, 0.5F * depth, ridge}, kind,
+              Material::kRoof);
     mesh.triangle({0, 0, height}, {0, depth, height}, {0, 0.5F * depth, ridge}, kind, wall);
-    mesh.triangle({width, 0, height}, {width, depth, height}, {width, 0.5F * depth, ridge}, kind, wall);
+    mesh.triangle({width, 0, height}, {width, depth, height}, {width, 0.5F * depth, ridge}, kind,
+                  wall);
   } else {
     mesh.quad({0, 0, height}, {width, 0, height}, {width, depth, height}, {0, depth, height}, kind,
               Material::kConcrete);
@@ -313,7 +329,8 @@ Mesh makeSign(int kind) {
   if (kind == 0) {
     const float radius = 0.33F;
     for (int i = 0; i < 20; ++i) {
-      const float a = static_cast<float>(2.0 * kPi * i / 20), b = static_cast<float>(2.0 * kPi * (i + 1) / 20);
+      const float a = static_cast<float>(2.0 * kPi * i / 20),
+                  b = static_cast<float>(2.0 * kPi * (i + 1) / 20);
       const Vector3f p(x, radius * std::cos(a), z + radius * std::sin(a));
       const Vector3f q(x, radius * std::cos(b), z + radius * std::sin(b));
       const Vector3f m(x, 0, z);
@@ -325,7 +342,8 @@ Mesh makeSign(int kind) {
     }
   } else {
     const float half = kind == 1 ? 0.3F : 0.45F, tall = kind == 1 ? 0.4F : 0.16F;
-    const Vector3f corners[4] = {{x, -half, z - tall}, {x, half, z - tall}, {x, half, z + tall}, {x, -half, z + tall}};
+    const Vector3f corners[4] = {
+        {x, -half, z - tall}, {x, half, z - tall}, {x, half, z + tall}, {x, -half, z + tall}};
     const Eigen::Vector2f unit[4] = {{-0.7F, -0.7F}, {0.7F, -0.7F}, {0.7F, 0.7F}, {-0.7F, 0.7F}};
     mesh.texturedQuad(corners, unit, Class::kSign, Material::kSignFace);
   }
@@ -337,7 +355,8 @@ Mesh makeBin() {
   mesh.box({-0.28F, -0.3F, 0.08F}, {0.28F, 0.3F, 1.0F}, Class::kUnlabeled, Material::kBin);
   mesh.box({-0.31F, -0.34F, 1.0F}, {0.31F, 0.33F, 1.08F}, Class::kUnlabeled, Material::kRubber);
   for (const float x : {-0.2F, 0.2F}) {
-    mesh.tube({x, 0.28F, 0.1F}, {x + 0.06F, 0.28F, 0.1F}, 0.1F, 0.1F, 10, Class::kUnlabeled, Material::kRubber);
+    mesh.tube({x, 0.28F, 0.1F}, {x + 0.06F, 0.28F, 0.1F}, 0.1F, 0.1F, 10, Class::kUnlabeled,
+              Material::kRubber);
   }
   return mesh;
 }
@@ -347,7 +366,8 @@ Mesh makeBench() {
   for (int i = 0; i < 4; ++i) {
     const float y = 0.11F * static_cast<float>(i);
     mesh.box({-0.8F, y, 0.42F}, {0.8F, y + 0.08F, 0.46F}, Class::kUnlabeled, Material::kWood);
-    mesh.box({-0.8F, 0.44F, 0.5F + y}, {0.8F, 0.48F, 0.58F + y}, Class::kUnlabeled, Material::kWood);
+    mesh.box({-0.8F, 0.44F, 0.5F + y}, {0.8F, 0.48F, 0.58F + y}, Class::kUnlabeled,
+             Material::kWood);
   }
   for (const float x : {-0.7F, 0.65F}) {
     mesh.box({x, 0.02F, 0.0F}, {x + 0.05F, 0.08F, 0.42F}, Class::kUnlabeled, Material::kMetal);
@@ -358,32 +378,38 @@ Mesh makeBench() {
 
 void addTorso(Mesh* mesh, Class kind, float hip, float lean) {
   const Vector3f top(lean, 0.0F, hip + 0.52F);
-  mesh->tube({0, 0, hip - 0.06F}, {0.5F * lean, 0, hip + 0.25F}, 0.16F, 0.15F, 10, kind, Material::kCloth);
+  mesh->tube({0, 0, hip - 0.06F}, {0.5F * lean, 0, hip + 0.25F}, 0.16F, 0.15F, 10, kind,
+             Material::kCloth);
   mesh->tube({0.5F * lean, 0, hip + 0.25F}, top, 0.15F, 0.2F, 10, kind, Material::kCloth);
   mesh->ellipsoid(top, {0.15F, 0.23F, 0.1F}, 8, kind, Material::kCloth);
   mesh->tube(top, top + Vector3f(0.02F, 0, 0.12F), 0.06F, 0.055F, 7, kind, Material::kSkin);
-  mesh->ellipsoid(top + Vector3f(0.04F, 0, 0.23F), {0.105F, 0.085F, 0.13F}, 9, kind, Material::kSkin);
-  mesh->ellipsoid(top + Vector3f(0.02F, 0, 0.27F), {0.11F, 0.095F, 0.11F}, 8, kind, Material::kHair);
+  mesh->ellipsoid(top + Vector3f(0.04F, 0, 0.23F), {0.105F, 0.085F, 0.13F}, 9, kind,
+                  Material::kSkin);
+  mesh->ellipsoid(top + Vector3f(0.02F, 0, 0.27F), {0.11F, 0.095F, 0.11F}, 8, kind,
+                  Material::kHair);
 }
 
 Mesh makeThigh() {
   Mesh mesh;
   mesh.tube({0, 0, 0}, {0, 0, -0.44F}, 0.095F, 0.065F, 9, Class::kPedestrian, Material::kTrousers);
-  mesh.ellipsoid({0, 0, -0.44F}, {0.066F, 0.066F, 0.066F}, 7, Class::kPedestrian, Material::kTrousers);
+  mesh.ellipsoid({0, 0, -0.44F}, {0.066F, 0.066F, 0.066F}, 7, Class::kPedestrian,
+                 Material::kTrousers);
   return mesh;
 }
 
 Mesh makeShin() {
   Mesh mesh;
   mesh.tube({0, 0, 0}, {0, 0, -0.4F}, 0.06F, 0.045F, 8, Class::kPedestrian, Material::kTrousers);
-  mesh.box({-0.06F, -0.045F, -0.46F}, {0.18F, 0.045F, -0.38F}, Class::kPedestrian, Material::kRubber);
+  mesh.box({-0.06F, -0.045F, -0.46F}, {0.18F, 0.045F, -0.38F}, Class::kPedestrian,
+           Material::kRubber);
   return mesh;
 }
 
 Mesh makeArm() {
   Mesh mesh;
   mesh.tube({0, 0, 0}, {0, 0, -0.3F}, 0.055F, 0.045F, 8, Class::kPedestrian, Material::kCloth);
-  mesh.tube({0, 0, -0.3F}, {0.1F, 0, -0.56F}, 0.042F, 0.035F, 7, Class::kPedestrian, Material::kCloth);
+  mesh.tube({0, 0, -0.3F}, {0.1F, 0, -0.56F}, 0.042F, 0.035F, 7, Class::kPedestrian,
+            Material::kCloth);
   mesh.ellipsoid({0.12F, 0, -0.6F}, {0.045F, 0.03F, 0.06F}, 6, Class::kPedestrian, Material::kSkin);
   return mesh;
 }
@@ -395,7 +421,8 @@ Mesh makeRider() {
   for (const float x : {-0.52F, 0.52F}) {
     const int parts = 20;
     for (int i = 0; i < parts; ++i) {
-      const float a = static_cast<float>(2.0 * kPi * i / parts), b = static_cast<float>(2.0 * kPi * (i + 1) / parts);
+      const float a = static_cast<float>(2.0 * kPi * i / parts),
+                  b = static_cast<float>(2.0 * kPi * (i + 1) / parts);
       mesh.tube({x + 0.34F * std::cos(a), 0, 0.34F + 0.34F * std::sin(a)},
                 {x + 0.34F * std::cos(b), 0, 0.34F + 0.34F * std::sin(b)}, 0.02F, 0.02F, 5, kind,
                 Material::kRubber);
@@ -407,23 +434,27 @@ Mesh makeRider() {
   }
   const Vector3f rear(-0.52F, 0, 0.34F), front(0.52F, 0, 0.34F), crank(-0.06F, 0, 0.3F);
   const Vector3f saddle(-0.24F, 0, 0.92F), head(0.38F, 0, 0.86F), bar(0.42F, 0, 1.02F);
-  const std::vector<std::pair<Vector3f, Vector3f>> frame = {{rear, crank}, {rear, saddle}, {crank, saddle},
-                                                            {crank, head}, {saddle, head}, {front, bar}};
+  const std::vector<std::pair<Vector3f, Vector3f>> frame = {
+      {rear, crank}, {rear, saddle}, {crank, saddle}, {crank, head}, {saddle, head}, {front, bar}};
   for (const auto& [from, to] : frame) mesh.tube(from, to, 0.02F, 0.02F, 6, kind, Material::kPaint);
-  mesh.tube(bar + Vector3f(0, -0.26F, 0), bar + Vector3f(0, 0.26F, 0), 0.016F, 0.016F, 6, kind, Material::kRubber);
+  mesh.tube(bar + Vector3f(0, -0.26F, 0), bar + Vector3f(0, 0.26F, 0), 0.016F, 0.016F, 6, kind,
+            Material::kRubber);
   mesh.box({-0.36F, -0.07F, 0.92F}, {-0.12F, 0.07F, 0.98F}, kind, Material::kRubber);
   const Vector3f hip(-0.22F, 0, 1.02F), chest(0.14F, 0, 1.45F);
   mesh.tube(hip, chest, 0.14F, 0.18F, 10, kind, Material::kCloth);
   mesh.ellipsoid(chest, {0.15F, 0.21F, 0.12F}, 8, kind, Material::kCloth);
   mesh.tube(chest, chest + Vector3f(0.1F, 0, 0.15F), 0.06F, 0.055F, 7, kind, Material::kSkin);
-  mesh.ellipsoid(chest + Vector3f(0.14F, 0, 0.25F), {0.105F, 0.085F, 0.13F}, 9, kind, Material::kSkin);
-  mesh.ellipsoid(chest + Vector3f(0.12F, 0, 0.3F), {0.14F, 0.1F, 0.1F}, 8, kind, Material::kSignFace);
+  mesh.ellipsoid(chest + Vector3f(0.14F, 0, 0.25F), {0.105F, 0.085F, 0.13F}, 9, kind,
+                 Material::kSkin);
+  mesh.ellipsoid(chest + Vector3f(0.12F, 0, 0.3F), {0.14F, 0.1F, 0.1F}, 8, kind,
+                 Material::kSignFace);
   for (const float s : {1.0F, -1.0F}) {
     const Vector3f knee(0.16F, 0.1F * s, s > 0 ? 0.86F : 0.66F);
     const Vector3f foot(-0.06F + (s > 0 ? 0.12F : -0.02F), 0.11F * s, s > 0 ? 0.46F : 0.2F);
     mesh.tube(hip + Vector3f(0, 0.09F * s, 0), knee, 0.09F, 0.065F, 8, kind, Material::kTrousers);
     mesh.tube(knee, foot, 0.06F, 0.045F, 8, kind, Material::kTrousers);
-    mesh.box(foot - Vector3f(0.06F, 0.04F, 0.05F), foot + Vector3f(0.18F, 0.04F, 0.02F), kind, Material::kRubber);
+    mesh.box(foot - Vector3f(0.06F, 0.04F, 0.05F), foot + Vector3f(0.18F, 0.04F, 0.02F), kind,
+             Material::kRubber);
     const Vector3f elbow(0.26F, 0.26F * s, 1.2F);
     mesh.tube(chest + Vector3f(0, 0.2F * s, 0), elbow, 0.055F, 0.045F, 7, kind, Material::kCloth);
     mesh.tube(elbow, bar + Vector3f(0, 0.22F * s, 0.03F), 0.042F, 0.035F, 7, kind, Material::kSkin);
@@ -522,8 +553,8 @@ class Builder {
       const Vector3f tint = kWalls[static_cast<int>(random_.uniform() * 2.999) + (brick ? 0 : 3)];
       const double setback = garden ? random_.uniform(3.0, 4.5) : 0.15;
       const int mesh = world_->addMesh(
-          makeHouse(Random(mixKeys(options_.seed, 17, surface_)), static_cast<float>(width), storeys,
-                    brick ? Material::kBrick : Material::kPlaster, garden || storeys < 3));
+          makeHouse(Random(mixKeys(options_.seed, 17, surface_)), static_cast<float>(width),
+                    storeys, brick ? Material::kBrick : Material::kPlaster, garden || storeys < 3));
       // The front looks to -y of the house, which is to the road on both sides.
       const double middle = s + 0.5 * width;
       const Transform T = onRoad(path_, middle, boundary + side * setback, kKerbHeight + 0.03,
@@ -540,9 +571,9 @@ class Builder {
     const float length = static_cast<float>(0.5 * width - 0.7);
     const std::uint32_t surface = nextSurface();
     for (const double half : {-0.5 * width, 0.7}) {
-      const Transform T = onRoad(path_, middle, boundary + side * 0.3, kKerbHeight + 0.03,
-                                 side > 0 ? 0.0 : kPi) *
-                          shifted(half, 0.0, 0.0);
+      const Transform T =
+          onRoad(path_, middle, boundary + side * 0.3, kKerbHeight + 0.03, side > 0 ? 0.0 : kPi) *
+          shifted(half, 0.0, 0.0);
       if (kind < 0.45) {
         add(world_->addMesh(makeFence(length, true)), T, surface, color(0.10, 0.12, 0.11));
       } else if (kind < 0.8) {
@@ -553,15 +584,16 @@ class Builder {
       }
     }
     if (random_.uniform() < 0.6) {
-      addTree(middle + random_.uniform(-0.35, 0.35) * width, boundary + side * (0.55 * setback), 0.5);
+      addTree(middle + random_.uniform(-0.35, 0.35) * width, boundary + side * (0.55 * setback),
+              0.5);
     }
   }
 
   void addTree(double along, double across, double size) {
     if (trees_.empty()) {
       for (int i = 0; i < 4; ++i) {
-        trees_.push_back(world_->addMesh(
-            makeTree(Random(mixKeys(options_.seed, 31, static_cast<std::uint64_t>(i))), 7.5, 2.6, 5200)));
+        trees_.push_back(world_->addMesh(makeTree(
+            Random(mixKeys(options_.seed, 31, static_cast<std::uint64_t>(i))), 7.5, 2.6, 5200)));
       }
     }
     Transform T = onRoad(path_, along, across, kKerbHeight, random_.uniform(0.0, 2.0 * kPi));
@@ -583,19 +615,23 @@ class Builder {
         add(lamp, onRoad(path_, s, kerb + side * 0.5, kKerbHeight, facing), nextSurface(),
             color(0.42, 0.45, 0.45));
       }
-      for (double s = from_ + random_.uniform(5.0, 12.0); s < to_; s += random_.uniform(11.0, 19.0)) {
+      for (double s = from_ + random_.uniform(5.0, 12.0); s < to_;
+           s += random_.uniform(11.0, 19.0)) {
         add(signs[static_cast<int>(random_.uniform() * 2.999)],
-            onRoad(path_, s, kerb + side * 0.45, kKerbHeight, facing + random_.uniform(-0.15, 0.15)),
+            onRoad(path_, s, kerb + side * 0.45, kKerbHeight,
+                   facing + random_.uniform(-0.15, 0.15)),
             nextSurface(), color(0.5, 0.52, 0.52));
       }
       for (double s = from_ + random_.uniform(2.0, 9.0); s < to_; s += random_.uniform(9.0, 17.0)) {
         addTree(s, kerb + side * random_.uniform(0.75, 0.95), 1.0);
       }
-      for (double s = from_ + random_.uniform(2.0, 9.0); s < to_; s += random_.uniform(10.0, 24.0)) {
+      for (double s = from_ + random_.uniform(2.0, 9.0); s < to_;
+           s += random_.uniform(10.0, 24.0)) {
         const bool sit = random_.uniform() < 0.3;
-        const double across = kerb + side * (sit ? kFootpathWidth - 0.7 : random_.uniform(0.6, 0.8));
-        add(sit ? bench : bin, onRoad(path_, s, across, kKerbHeight + 0.02, facing),
-            nextSurface(), random_.uniform() < 0.5 ? color(0.12, 0.3, 0.14) : color(0.4, 0.28, 0.2));
+        const double across =
+            kerb + side * (sit ? kFootpathWidth - 0.7 : random_.uniform(0.6, 0.8));
+        add(sit ? bench : bin, onRoad(path_, s, across, kKerbHeight + 0.02, facing), nextSurface(),
+            random_.uniform() < 0.5 ? color(0.12, 0.3, 0.14) : color(0.4, 0.28, 0.2));
       }
     }
   }
@@ -621,7 +657,8 @@ class Builder {
   void addParkedCars() {
     makeVehicles();
     for (const int side : {1, -1}) {
-      const double across = (side > 0 ? kRoadLeft : kRoadRight) - side * (0.5 * kParkingWidth + 0.05);
+      const double across =
+          (side > 0 ? kRoadLeft : kRoadRight) - side * (0.5 * kParkingWidth + 0.05);
       for (double s = from_ + random_.uniform(0.0, 5.0); s < to_; s += random_.uniform(5.8, 7.0)) {
         if (random_.uniform() > 0.55) continue;
         add(anyVehicle(),
@@ -645,9 +682,11 @@ class Builder {
     const double mean = path_.distance(0.5) / 0.5;
     if (options_.moving) {
       world_->addMoving(vehicles_[1], alongRoad(17.0, 0.1, 0.0, mean), nextSurface(), anyPaint());
-      world_->addMoving(vehicles_[2], alongRoad(-16.0, 0.0, 0.0, 0.6 * mean), nextSurface(), anyPaint());
+      world_->addMoving(vehicles_[2], alongRoad(-16.0, 0.0, 0.0, 0.6 * mean), nextSurface(),
+                        anyPaint());
     }
-    for (double s = random_.uniform(12.0, 18.0) + from_; s < to_ + 60.0; s += random_.uniform(20.0, 34.0)) {
+    for (double s = random_.uniform(12.0, 18.0) + from_; s < to_ + 60.0;
+         s += random_.uniform(20.0, 34.0)) {
       world_->addMoving(anyVehicle(), alongRoad(s, -3.5, 0.0, -random_.uniform(8.0, 9.0)),
                         nextSurface(), anyPaint());
     }
@@ -663,8 +702,8 @@ class Builder {
   }
 
   Vector3f anyCloth() {
-    static const Vector3f kCloths[] = {color(0.55, 0.1, 0.1),  color(0.1, 0.2, 0.5),
-                                       color(0.75, 0.7, 0.2),  color(0.12, 0.12, 0.13),
+    static const Vector3f kCloths[] = {color(0.55, 0.1, 0.1),   color(0.1, 0.2, 0.5),
+                                       color(0.75, 0.7, 0.2),   color(0.12, 0.12, 0.13),
                                        color(0.75, 0.75, 0.75), color(0.15, 0.38, 0.3),
                                        color(0.6, 0.35, 0.15)};
     return kCloths[static_cast<int>(random_.uniform() * 6.999)];
@@ -712,7 +751,8 @@ class Builder {
       world_->addMoving(
           meshes.shin,
           [=](double t) {
-            const double bend = 0.3 + 0.3 * std::cos(rate * t + phase + (s > 0.0 ? 0.0 : kPi) + 0.4);
+            const double bend =
+                0.3 + 0.3 * std::cos(rate * t + phase + (s > 0.0 ? 0.0 : kPi) + 0.4);
             return Transform(leg(t) * shifted(0.0, 0.0, -0.44) * pitched(bend));
           },
           surface, tint);

@@ -150,9 +150,9 @@ int World::addMesh(Mesh mesh) {
   rtcSetSceneFlags(scene, RTC_SCENE_FLAG_ROBUST);
   rtcSetSceneBuildQuality(scene, RTC_BUILD_QUALITY_HIGH);
   RTCGeometry geometry = rtcNewGeometry(device_, RTC_GEOMETRY_TYPE_TRIANGLE);
-  auto* vertices = static_cast<float*>(
-      rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3,
-                              3 * sizeof(float), mesh.vertices.size()));
+  auto* vertices = static_cast<float*>(rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0,
+                                                               RTC_FORMAT_FLOAT3, 3 * sizeof(float),
+                                                               mesh.vertices.size()));
   for (const Eigen::Vector3f& vertex : mesh.vertices) {
     for (int i = 0; i < 3; ++i) *vertices++ = vertex[i];
   }
@@ -173,12 +173,12 @@ int World::addMesh(Mesh mesh) {
 
 void World::addStatic(int mesh, const Transform& T_world_object, std::uint32_t surface,
                       const Eigen::Vector3f& tint) {
-  addMoving(mesh, [T_world_object](double) { return T_world_object; }, surface, tint);
+  addMoving(
+      mesh, [T_world_object](double) { return T_world_object; }, surface, tint);
   objects_.back().moves = false;
 }
 
-void World::addMoving(int mesh, Motion motion, std::uint32_t surface,
-                      const Eigen::Vector3f& tint) {
+void World::addMoving(int mesh, Motion motion, std::uint32_t surface, const Eigen::Vector3f& tint) {
   Object object;
   object.mesh = mesh;
   object.motion = std::move(motion);

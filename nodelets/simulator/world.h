@@ -49,7 +49,7 @@ enum class Material : std::uint8_t {
   kConcrete,
   kBark,
   kLeaf,
-  kPaint,     ///< of a car, tinted
+  kPaint,  ///< of a car, tinted
   kCarGlass,
   kRubber,
   kHeadlight,
@@ -140,8 +140,8 @@ class World {
     bool moves = false;
     std::uint32_t surface = 0;
     Eigen::Vector3f tint;
-    Transform T_world_object;           ///< at the instant
-    Eigen::Isometry3f T_object_world;   ///< at the instant
+    Transform T_world_object;          ///< at the instant
+    Eigen::Isometry3f T_object_world;  ///< at the instant
     RTCGeometry in_sweep = nullptr;
     RTCGeometry in_instant = nullptr;
   };
