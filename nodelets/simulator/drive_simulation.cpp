@@ -469,7 +469,7 @@ class Simulation {
       savePicture(c, picture);
       const cv::Mat edges = distanceToClassEdge(picture.labels);
       for (const std::size_t scan : found->second.at(static_cast<int>(c))) {
-        lookForPoints(c, time, T_world_base, edges, &scans_[scan]);
+        lookForPoints(c, time, T_world_base, picture.labels, edges, &scans_[scan]);
       }
     }
   }
@@ -518,8 +518,10 @@ class Simulation {
         continue;
       }
       scan->visible[i] = static_cast<std::uint16_t>(scan->visible[i] | (1U << c));
-      scan->edge_px[i * cameras_.size() + c] =
-          edges.at<float>(pixelIndex(pixel->y()), pixelIndex(pixel->x()));
+      // Through a gap smaller than a pixel, the pixel's centre shows something else: an edge.
+      const int u = pixelIndex(pixel->x()), v = pixelIndex(pixel->y());
+      const bool shown = labels.at<std::uint8_t>(v, u) == static_cast<std::uint8_t>(echo.kind);
+      scan->edge_px[i * cameras_.size() + c] = shown ? edges.at<float>(v, u) : 0.0F;
     }
   }
 
