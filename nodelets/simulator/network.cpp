@@ -14,11 +14,11 @@ namespace simulator {
 namespace {
 
 // In cells of the score grid.
-constexpr float kBorderShift = 1.6F;     ///< standard size of the borders' displacement
+constexpr float kBorderShift = 1.2F;     ///< standard size of the borders' displacement
 constexpr float kBorderPatch = 5.0F;     ///< over which it stays alike
-constexpr double kBlurSigma = 0.9;       ///< of the borders
+constexpr double kBlurSigma = 0.7;       ///< of the borders
 constexpr float kConfusionPatch = 9.0F;  ///< size of patches of a wrong class
-constexpr float kGain = 9.0F;            ///< logit of a class that is all there is
+constexpr float kGain = 10.5F;           ///< logit of a class that is all there is
 constexpr float kFineNoise = 0.7F, kPatchNoise = 1.6F;
 
 /// How often a patch of the first class is taken for the second.
@@ -28,21 +28,21 @@ struct Confusion {
 };
 constexpr Confusion kConfusions[] = {
     {Class::kBuilding, Class::kFence, 0.04F},
-    {Class::kBuilding, Class::kVegetation, 0.03F},
-    {Class::kBuilding, Class::kVehicle, 0.015F},
+    {Class::kBuilding, Class::kVegetation, 0.06F},
+    {Class::kBuilding, Class::kVehicle, 0.02F},
     {Class::kPole, Class::kBuilding, 0.18F},
     {Class::kPole, Class::kSign, 0.08F},
     {Class::kPole, Class::kVegetation, 0.10F},
     {Class::kRoad, Class::kUndrivableRoad, 0.02F},
-    {Class::kUndrivableRoad, Class::kRoad, 0.08F},
+    {Class::kUndrivableRoad, Class::kRoad, 0.11F},
     {Class::kUndrivableRoad, Class::kVegetation, 0.04F},
-    {Class::kVegetation, Class::kBuilding, 0.05F},
+    {Class::kVegetation, Class::kBuilding, 0.10F},
     {Class::kVegetation, Class::kUndrivableRoad, 0.03F},
     {Class::kSign, Class::kBuilding, 0.12F},
     {Class::kSign, Class::kPole, 0.12F},
     {Class::kFence, Class::kBuilding, 0.15F},
     {Class::kFence, Class::kVegetation, 0.15F},
-    {Class::kVehicle, Class::kBuilding, 0.02F},
+    {Class::kVehicle, Class::kBuilding, 0.05F},
     {Class::kVehicle, Class::kRoad, 0.015F},
     {Class::kPedestrian, Class::kRider, 0.12F},
     {Class::kPedestrian, Class::kBuilding, 0.08F},
