@@ -501,7 +501,7 @@ class Simulation {
 
   /// Marks the points of a scan that the camera sees, by a ray to where each is now.
   void lookForPoints(std::size_t c, double time, const Transform& T_world_base,
-                     const cv::Mat& edges, Scan* scan) const {
+                     const cv::Mat& labels, const cv::Mat& edges, Scan* scan) const {
     const Camera& camera = cameras_[c].camera;
     const Transform T_world_camera = T_world_base * camera.T_base_camera();
     const Transform T_camera_world = T_world_camera.inverse();
