@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 #include "fusion_nodelet.h"
 
+#include <nodelet/detail/callback_queue.h>
 #include <ros/master.h>
 
 #include <algorithm>
@@ -60,12 +61,26 @@ std::string describeSilentTopic(const std::string& topic, const ros::master::V_T
 
 }  // namespace
 
-FusionNodelet::~FusionNodelet() {
+FusionNodelet::~FusionNodelet() { stop(); }
+
+void FusionNodelet::stop() {
   diagnostics_timer_.stop();
   tick_timer_.stop();
+  gate_->close();
+}
+
+void FusionNodelet::keepQueues() {
+  ros::CallbackQueueInterface* const queues[] = {getNodeHandle().getCallbackQueue(),
+                                                 getMTNodeHandle().getCallbackQueue()};
+  for (int i = 0; i < 2; ++i) {
+    if (auto* queue = dynamic_cast<nodelet::detail::CallbackQueue*>(queues[i])) {
+      kept_queues_[i] = std::shared_ptr<void>(nullptr, [q = queue->shared_from_this()](void*) {});
+    }
+  }
 }
 
 void FusionNodelet::onInit() {
+  keepQueues();
   try {
     rig_ = loadRigFromParameters(getPrivateNodeHandle());
     diagnostics_ = std::make_unique<diagnostic_updater::Updater>(getNodeHandle(),
@@ -83,8 +98,9 @@ void FusionNodelet::onInit() {
     }
     // Wall time: ROS timers stand still while /clock is silent, which is one thing to report.
     diagnostics_timer_ = getMTNodeHandle().createWallTimer(
-        kDiagnosticsPeriod,
-        [this](const ros::WallTimerEvent&) { guard("watchdog", [this] { watch(); }); });
+        kDiagnosticsPeriod, [this, gate = gate_](const ros::WallTimerEvent&) {
+          gate->pass([this] { guard("watchdog", [this] { watch(); }); });
+        });
   } catch (const ConfigError& problem) {
     NODELET_FATAL_STREAM(problem.what());
   } catch (const std::exception& problem) {
@@ -94,7 +110,9 @@ void FusionNodelet::onInit() {
 
 void FusionNodelet::startTicking() {
   tick_timer_ = getNodeHandle().createWallTimer(
-      kTickPeriod, [this](const ros::WallTimerEvent&) { guard("tick", [this] { tick(now()); }); });
+      kTickPeriod, [this, gate = gate_](const ros::WallTimerEvent&) {
+        gate->pass([this] { guard("tick", [this] { tick(now()); }); });
+      });
 }
 
 StampNs FusionNodelet::now() const {

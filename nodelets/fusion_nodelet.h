@@ -12,7 +12,7 @@
 #include <nodelet/nodelet.h>
 #include <ros/ros.h>
 
-#include <atomic>
+#include <condition_variable>
 #include <exception>
 #include <functional>
 #include <map>
@@ -25,6 +25,36 @@
 
 namespace semantic_lidar_fusion {
 
+/// Lets callbacks in until it is closed. Unloading disables a nodelet's queues, but does not wait
+/// for a callback that runs on another thread.
+class CallbackGate {
+ public:
+  /// Runs `work`, unless the gate is closed.
+  template <class Work>
+  void pass(const Work& work) {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      if (closed_) return;
+      ++inside_;
+    }
+    work();  // does not throw: guarded
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (--inside_ == 0) empty_.notify_all();
+  }
+  /// Returns when nothing is inside any more.
+  void close() {
+    std::unique_lock<std::mutex> lock(mutex_);
+    closed_ = true;
+    empty_.wait(lock, [this] { return inside_ == 0; });
+  }
+
+ private:
+  std::mutex mutex_;
+  std::condition_variable empty_;
+  int inside_ = 0;
+  bool closed_ = false;
+};
+
 class FusionNodelet : public nodelet::Nodelet {
  public:
   ~FusionNodelet() override;
@@ -36,12 +66,13 @@ class FusionNodelet : public nodelet::Nodelet {
   /// Demand has changed: subscribe on the first listener, shut down on the last. Called with
   /// `connectMutex` held.
   virtual void updateSubscriptions() {}
-  /// A clock jump was seen: forget buffered data.
-  virtual void startEpoch(const std::string& /*why*/) {}
   /// Why nothing has to be published (nobody listens), in words; empty = something should be.
   virtual std::string explainSilence() { return {}; }
   /// Called every `kTickPeriod` with now(), one at a time with the callbacks of getNodeHandle().
   virtual void tick(StampNs /*now_ns*/) {}
+  /// Ends all callbacks and waits for those that run. Every destructor of a derived class calls it
+  /// first: its members are gone when this class's destructor runs.
+  void stop();
   /// Asks for `tick`; call in initialize.
   void startTicking();
 
@@ -74,9 +105,11 @@ class FusionNodelet : public nodelet::Nodelet {
     const std::string resolved = handle.resolveName(topic);
     health_.expectInput(resolved, expect);
     const boost::function<void(const boost::shared_ptr<const M>&)> guarded =
-        [this, resolved, callback](const boost::shared_ptr<const M>& message) {
-          health_.received(resolved);
-          guard(resolved, [&] { callback(message); });
+        [this, gate = gate_, resolved, callback](const boost::shared_ptr<const M>& message) {
+          gate->pass([&] {
+            health_.received(resolved);
+            guard(resolved, [&] { callback(message); });
+          });
         };
     return handle.subscribe<M>(topic, static_cast<uint32_t>(queue_size), guarded,
                                ros::VoidConstPtr(), ros::TransportHints().tcpNoDelay());
@@ -92,12 +125,15 @@ class FusionNodelet : public nodelet::Nodelet {
   /// Advertises a topic whose first listener and last farewell call updateSubscriptions.
   template <class M>
   ros::Publisher advertise(ros::NodeHandle& handle, const std::string& topic, int queue_size) {
-    const ros::SubscriberStatusCallback changed = [this](const ros::SingleSubscriberPublisher&) {
-      guard("connection", [this] {
-        std::lock_guard<std::mutex> lock(connect_mutex_);
-        if (initialized_) updateSubscriptions();
-      });
-    };
+    const ros::SubscriberStatusCallback changed =
+        [this, gate = gate_](const ros::SingleSubscriberPublisher&) {
+          gate->pass([this] {
+            guard("connection", [this] {
+              std::lock_guard<std::mutex> lock(connect_mutex_);
+              if (initialized_) updateSubscriptions();
+            });
+          });
+        };
     return handle.advertise<M>(topic, static_cast<uint32_t>(queue_size), changed, changed);
   }
 
@@ -117,6 +153,12 @@ class FusionNodelet : public nodelet::Nodelet {
   bool mayReport(const std::string& key);
   void watch();
 
+  void keepQueues();
+
+  /// A callback that runs while the nodelet is unloaded holds it until it returns, and the manager
+  /// has destroyed the queues by then, into which timers and publishers reach as they end.
+  std::shared_ptr<void> kept_queues_[2];
+  std::shared_ptr<CallbackGate> gate_ = std::make_shared<CallbackGate>();
   Rig rig_;
   Health health_;
   std::mutex connect_mutex_;

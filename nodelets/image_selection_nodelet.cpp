@@ -29,6 +29,9 @@ constexpr std::size_t kKnownStamps = 64;
 }  // namespace
 
 class ImageSelectionNodelet : public FusionNodelet {
+ public:
+  ~ImageSelectionNodelet() override { stop(); }
+
  private:
   struct Image {
     sensor_msgs::ImageConstPtr raw;
@@ -95,20 +98,20 @@ class ImageSelectionNodelet : public FusionNodelet {
     const CameraConfig& config = camera.config;
     if (config.transport == ImageTransport::kCompressed) {
       camera.images_subscriber = subscribe<sensor_msgs::CompressedImage>(
-          getNodeHandle(), imageTopic(config), 8,
+          getNodeHandle(), imageTopic(config), 32,
           [this, index](const sensor_msgs::CompressedImageConstPtr& image) {
             onImage(index, {nullptr, image}, stampNs(image->header.stamp));
           });
     } else {
       camera.images_subscriber = subscribe<sensor_msgs::Image>(
-          getNodeHandle(), imageTopic(config), 8,
+          getNodeHandle(), imageTopic(config), 32,
           [this, index](const sensor_msgs::ImageConstPtr& image) {
             onImage(index, {image, nullptr}, stampNs(image->header.stamp));
           });
     }
     if (candidatesNeedSemantics()) {
       camera.semantics_subscriber = subscribe<sensor_msgs::Image>(
-          getNodeHandle(), semanticsTopic(rig(), config), 8,
+          getNodeHandle(), semanticsTopic(rig(), config), 32,
           [this, index](const sensor_msgs::ImageConstPtr& scores) { onSemantics(index, *scores); });
     }
     if (sweep_) {
@@ -210,7 +213,8 @@ class ImageSelectionNodelet : public FusionNodelet {
         return false;
       case StampVerdict::kNewEpoch:
         health().count("clock jumps");
-        NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
+        NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
+                                              << " s: starting anew");
         selector_->reset();
         for (const auto& camera : cameras_) {
           camera->images.clear();

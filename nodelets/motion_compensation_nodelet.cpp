@@ -31,6 +31,9 @@ constexpr StampNs kReferenceGraceNs = 500000000;
 }  // namespace
 
 class MotionCompensationNodelet : public FusionNodelet {
+ public:
+  ~MotionCompensationNodelet() override { stop(); }
+
  private:
   struct Scan {
     TimedCloud cloud;
@@ -122,7 +125,8 @@ class MotionCompensationNodelet : public FusionNodelet {
       health().count("dropped: scan pending at a clock jump", pending_.size());
       pending_.clear();
       references_.clear();
-      NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
+      NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
+                                            << " s: starting anew");
     }
     if (verdict == StampVerdict::kStale) {
       health().count("dropped: " + source + " from before a clock jump");

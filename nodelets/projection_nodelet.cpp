@@ -32,6 +32,9 @@ constexpr std::size_t kKeptImages = 24;
 }  // namespace
 
 class ProjectionNodelet : public FusionNodelet {
+ public:
+  ~ProjectionNodelet() override { stop(); }
+
  private:
   /// The parts of one image's semantics, as they come.
   struct Semantics {
@@ -99,7 +102,7 @@ class ProjectionNodelet : public FusionNodelet {
             void (ProjectionNodelet::*callback)(Camera*, const sensor_msgs::ImageConstPtr&)) {
           if (needed && !*subscriber) {
             *subscriber = subscribe<sensor_msgs::Image>(
-                getNodeHandle(), topic, 8,
+                getNodeHandle(), topic, 32,
                 [this, camera, callback](const sensor_msgs::ImageConstPtr& message) {
                   (this->*callback)(camera, message);
                 });
@@ -202,7 +205,8 @@ class ProjectionNodelet : public FusionNodelet {
         camera->semantics.clear();
         camera->images.clear();
       }
-      NODELET_INFO_STREAM("time jumped to " << toSeconds(stamp) << " s: starting anew");
+      NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
+                                            << " s: starting anew");
     }
     if (verdict == StampVerdict::kStale) {
       health().count("dropped: " + source + " from before a clock jump");

@@ -20,7 +20,7 @@ namespace semantic_lidar_fusion {
 class SegmentationNodelet : public FusionNodelet {
  public:
   ~SegmentationNodelet() override {
-    for (Camera& camera : cameras_) camera.subscriber.shutdown();
+    stop();
     {
       std::lock_guard<std::mutex> lock(mutex_);
       stopping_ = true;
@@ -56,7 +56,7 @@ class SegmentationNodelet : public FusionNodelet {
       const bool wanted = camera.scores.getNumSubscribers() > 0;
       if (wanted && !camera.subscriber) {
         camera.subscriber = subscribe<sensor_msgs::Image>(
-            getNodeHandle(), cameraTopic(rig().cameras[i], "image_selected"), 4,
+            getNodeHandle(), cameraTopic(rig().cameras[i], "image_selected"), 16,
             [this, i](const sensor_msgs::ImageConstPtr& image) { onImage(i, image); });
       } else if (!wanted && camera.subscriber) {
         unsubscribe(&camera.subscriber);

@@ -33,6 +33,9 @@ constexpr std::size_t kWaitingScores = 24;
 }  // namespace
 
 class SuperpixelUncertaintyNodelet : public FusionNodelet {
+ public:
+  ~SuperpixelUncertaintyNodelet() override { stop(); }
+
  private:
   struct Camera {
     explicit Camera(const Rig& rig, const CameraConfig& config)
@@ -160,7 +163,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
                const ImageSize& map_size) {
     const StageTimer timer(health(), "superpixels");
     camera->maps.put(stamp, std::make_shared<const SuperpixelMap>(
-                                camera->semantics.cluster(colorImage(image), map_size)));
+                                camera->semantics.cluster(colorImage(image), map_size, stamp)));
   }
 
   using Outputs = std::vector<std::pair<const ros::Publisher*, sensor_msgs::ImagePtr>>;
@@ -181,7 +184,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     }
     if (scores == nullptr) return outputs;
 
-    const cv::Mat values = pixelView(**scores);
+    const cv::Mat values = fromSemantics(*camera, [&] { return pixelView(**scores); });
     const ImageSize image_size{static_cast<int>((*image)->width),
                                static_cast<int>((*image)->height)};
     const ImageSize map_size = *camera->semantics.mapSize(image_size);
@@ -195,9 +198,13 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     }
     if (camera->config.input == CameraInput::kLabels) {
       const StageTimer timer(health(), "histogram");
-      outputs.emplace_back(
-          &camera->probabilities,
-          imageMessage(histogramProbabilities(**map, values, rig().classes.size()), header));
+      outputs.emplace_back(&camera->probabilities,
+                           imageMessage(fromSemantics(*camera,
+                                                      [&] {
+                                                        return histogramProbabilities(
+                                                            **map, values, rig().classes.size());
+                                                      }),
+                                        header));
     } else {
       addShare(*camera, **map, values, *image, &outputs);
     }
@@ -207,12 +214,24 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     return outputs;
   }
 
+  /// What `work` makes of the scores or labels; an error names their topic, whichever message's
+  /// arrival it is that shows it.
+  template <class Work>
+  auto fromSemantics(const Camera& camera, const Work& work) -> decltype(work()) {
+    try {
+      return work();
+    } catch (const DataError& problem) {
+      throw DataError(getNodeHandle().resolveName(semanticsTopic(rig(), camera.config)) + ": " +
+                      problem.what());
+    }
+  }
+
   void addShare(const Camera& camera, const SuperpixelMap& map, const cv::Mat& scores,
                 const sensor_msgs::ImageConstPtr& image, Outputs* outputs) {
     ShareMap share;
     {
       const StageTimer timer(health(), "share");
-      share = camera.semantics.share(map, scores);
+      share = fromSemantics(camera, [&] { return camera.semantics.share(map, scores); });
     }
     health().count("non-finite score cells", share.nonfinite_cells);
     outputs->emplace_back(&camera.share, imageMessage(share.share, image->header));

@@ -12,6 +12,7 @@ SlicConfig slicConfig(const SuperpixelConfig& config) {
   slic.count = config.count;
   slic.compactness = config.compactness;
   slic.iterations = config.iterations;
+  slic.warm_start = config.warm_start;
   return slic;
 }
 
@@ -31,8 +32,9 @@ void CameraSemantics::noteScores(const cv::Mat& scores) {
   if (!scores.empty()) scores_size_ = ImageSize{scores.cols, scores.rows};
 }
 
-SuperpixelMap CameraSemantics::cluster(const cv::Mat& image, const ImageSize& map_size) {
-  return slic_.cluster(image, map_size);
+SuperpixelMap CameraSemantics::cluster(const cv::Mat& image, const ImageSize& map_size,
+                                       StampNs stamp) {
+  return slic_.cluster(image, map_size, stamp);
 }
 
 ShareMap CameraSemantics::share(const SuperpixelMap& superpixels, const cv::Mat& scores) const {

@@ -3,163 +3,23 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <numeric>
+#include <cstdlib>
 #include <utility>
 
 namespace semantic_lidar_fusion {
 namespace {
 
-/// Root of a set; halves the path on the way. Parents never have a larger index than their
-/// children, so a root is the first run of its set.
-int findRoot(std::vector<int>* parent, int run) {
-  while ((*parent)[run] != run) {
-    (*parent)[run] = (*parent)[(*parent)[run]];
-    run = (*parent)[run];
-  }
-  return run;
-}
-
-void unite(std::vector<int>* parent, int a, int b) {
-  a = findRoot(parent, a);
-  b = findRoot(parent, b);
-  (*parent)[std::max(a, b)] = std::min(a, b);
-}
-
 /// Calls `visit(upper, lower)` for each pair of runs of neighbouring rows that share a column.
 template <typename Visit>
-void forEachVerticalContact(const RunImage& runs, const Visit& visit) {
-  for (int y = 1; y < runs.size.height; ++y) {
-    int upper = runs.row_first[y - 1];
-    const int upper_end = runs.row_first[y];
-    for (int lower = runs.row_first[y]; lower < runs.row_first[y + 1]; ++lower) {
-      const int end = lower + 1 < runs.row_first[y + 1] ? runs.begin[lower + 1] : runs.size.width;
-      while (upper + 1 < upper_end && runs.begin[upper + 1] <= runs.begin[lower]) ++upper;
-      visit(upper, lower);
-      while (upper + 1 < upper_end && runs.begin[upper + 1] < end) visit(++upper, lower);
+void forEachVerticalContact(const RunImage& image, const Visit& visit) {
+  for (int y = 1; y < image.size.height; ++y) {
+    int upper = image.row_first[y - 1];
+    for (int lower = image.row_first[y]; lower + 1 < image.row_first[y + 1]; ++lower) {
+      const int end = image.runs[lower + 1].begin;
+      while (image.runs[upper + 1].begin <= image.runs[lower].begin) ++upper;
+      for (int u = upper; image.runs[u].begin < end; ++u) visit(u, lower);
     }
   }
-}
-
-struct Components {
-  std::vector<int> of_run;     ///< component of each run; components in raster order
-  std::vector<int> first_run;  ///< of each component
-  std::vector<int> size;       ///< pixels of each component
-};
-
-Components connectedComponents(const RunImage& runs) {
-  const int run_count = static_cast<int>(runs.begin.size());
-  std::vector<int> parent(run_count);
-  std::iota(parent.begin(), parent.end(), 0);
-  forEachVerticalContact(runs, [&](int upper, int lower) {
-    if (runs.label[upper] == runs.label[lower]) unite(&parent, upper, lower);
-  });
-
-  Components components;
-  components.of_run.resize(run_count);
-  for (int y = 0; y < runs.size.height; ++y) {
-    for (int run = runs.row_first[y]; run < runs.row_first[y + 1]; ++run) {
-      if (parent[run] == run) {
-        components.of_run[run] = static_cast<int>(components.size.size());
-        components.first_run.push_back(run);
-        components.size.push_back(0);
-      } else {
-        components.of_run[run] = components.of_run[parent[run]];
-      }
-      const int end = run + 1 < runs.row_first[y + 1] ? runs.begin[run + 1] : runs.size.width;
-      components.size[components.of_run[run]] += end - runs.begin[run];
-    }
-  }
-  return components;
-}
-
-struct CountRange {
-  int lowest, highest;
-};
-
-CountRange toleratedCounts(int wanted) { return {wanted - wanted / 20, wanted + wanted / 20}; }
-
-/// The components that become superpixels: all of at least `min_size` pixels, but as many of the
-/// largest as the tolerated counts ask for; the earlier of equal ones.
-std::vector<char> chooseKept(const std::vector<int>& sizes, int min_size, const CountRange& range) {
-  const int component_count = static_cast<int>(sizes.size());
-  std::vector<char> kept(component_count, 0);
-  int large = 0;
-  for (int c = 0; c < component_count; ++c) large += kept[c] = sizes[c] >= min_size;
-  const int wanted =
-      std::min(std::max(large, range.lowest), std::min(range.highest, component_count));
-  if (wanted == large) return kept;
-
-  std::vector<int> by_size(component_count);
-  std::iota(by_size.begin(), by_size.end(), 0);
-  std::stable_sort(by_size.begin(), by_size.end(),
-                   [&](int a, int b) { return sizes[a] > sizes[b]; });
-  for (int i = 0; i < component_count; ++i) kept[by_size[i]] = i < wanted;
-  return kept;
-}
-
-/// For each component the kept one that it belongs to: itself, or the one that its first pixel's
-/// left or upper neighbour belongs to.
-std::vector<int> joinSmall(const RunImage& runs, const Components& components,
-                           const std::vector<char>& kept) {
-  const int component_count = static_cast<int>(components.size.size());
-  // Neighbours to the left and above are earlier components, so that one pass resolves all but
-  // those that end in a small component 0.
-  std::vector<int> owner(component_count);
-  std::vector<int> row_of_first(component_count);
-  for (int y = 0; y < runs.size.height; ++y) {
-    for (int run = runs.row_first[y]; run < runs.row_first[y + 1]; ++run) {
-      const int c = components.of_run[run];
-      if (components.first_run[c] == run) row_of_first[c] = y;
-    }
-  }
-  for (int c = 0; c < component_count; ++c) {
-    owner[c] = c;
-    if (kept[c] || c == 0) continue;
-    const int run = components.first_run[c];
-    const int y = row_of_first[c];
-    int neighbour = run - 1;
-    if (runs.begin[run] == 0) neighbour = runs.row_first[y - 1];
-    owner[c] = owner[components.of_run[neighbour]];
-  }
-  if (kept[0]) return owner;
-
-  // The first contact of component 0's followers with a kept one decides for all of them.
-  int adopter = -1;
-  const auto consider = [&](int run_a, int run_b) {
-    const int a = owner[components.of_run[run_a]];
-    const int b = owner[components.of_run[run_b]];
-    if (adopter < 0 && (a == 0) != (b == 0)) adopter = a == 0 ? b : a;
-  };
-  for (int y = 0; y < runs.size.height; ++y) {
-    for (int run = runs.row_first[y] + 1; run < runs.row_first[y + 1]; ++run) {
-      consider(run - 1, run);
-    }
-  }
-  forEachVerticalContact(runs, consider);
-  std::replace(owner.begin(), owner.end(), 0, adopter);
-  return owner;
-}
-
-/// Writes the owners as ids in raster order of first appearance.
-SuperpixelMap paint(const RunImage& runs, const Components& components,
-                    const std::vector<int>& owner) {
-  SuperpixelMap map;
-  map.ids.create(runs.size.height, runs.size.width, CV_32SC1);
-  std::vector<int> id_of(owner.size(), -1);
-  for (int y = 0; y < runs.size.height; ++y) {
-    int* row = map.ids.ptr<int>(y);
-    for (int run = runs.row_first[y]; run < runs.row_first[y + 1]; ++run) {
-      int& id = id_of[owner[components.of_run[run]]];
-      if (id < 0) {
-        id = map.count++;
-        map.sizes.push_back(0);
-      }
-      const int end = run + 1 < runs.row_first[y + 1] ? runs.begin[run + 1] : runs.size.width;
-      std::fill(row + runs.begin[run], row + end, id);
-      map.sizes[id] += end - runs.begin[run];
-    }
-  }
-  return map;
 }
 
 /// Gives a connected part of superpixel `split`, near half of it, the id map->count: a subtree of
@@ -220,16 +80,155 @@ void renumberInRasterOrder(SuperpixelMap* map) {
 
 }  // namespace
 
-SuperpixelMap connectedRegions(const RunImage& runs, int wanted) {
-  const Components components = connectedComponents(runs);
-  const CountRange range = toleratedCounts(wanted);
-  const std::int64_t pixels = static_cast<std::int64_t>(runs.size.width) * runs.size.height;
-  const int min_size = static_cast<int>(std::max<std::int64_t>(1, pixels / wanted / 4));
-  const std::vector<char> kept = chooseKept(components.size, min_size, range);
-  SuperpixelMap map = paint(runs, components, joinSmall(runs, components, kept));
+int RegionConnector::root(int component) {
+  while (components_[component].parent != component) {
+    const int parent = components_[component].parent;
+    component = components_[component].parent = components_[parent].parent;
+  }
+  return component;
+}
 
-  if (map.count >= range.lowest) return map;
-  while (map.count < range.lowest) {
+void RegionConnector::findComponents(const RunImage& image) {
+  component_of_run_.resize(image.runs.size());
+  components_.clear();
+  const Run* runs = image.runs.data();
+  int* component_of = component_of_run_.data();
+  for (int y = 0; y < image.size.height; ++y) {
+    // Above row 0 there is only an end mark.
+    int upper = y > 0 ? image.row_first[y - 1] : image.row_first[1] - 1;
+    const int upper_end = y > 0 ? image.row_first[y] - 1 : upper;
+    for (int run = image.row_first[y]; run + 1 < image.row_first[y + 1]; ++run) {
+      const int begin = runs[run].begin, end = runs[run + 1].begin, label = runs[run].label;
+      int component = -1;
+      while (upper < upper_end && runs[upper + 1].begin <= begin) ++upper;
+      for (int u = upper; u < upper_end && runs[u].begin < end; ++u) {
+        if (runs[u].label != label || component_of[u] == component) continue;
+        if (component < 0) {
+          component = component_of[u];
+          continue;
+        }
+        const int a = root(component), b = root(component_of[u]);
+        components_[std::max(a, b)].parent = std::min(a, b);
+      }
+      if (component < 0) {
+        component = static_cast<int>(components_.size());
+        components_.push_back({component, 0, run, y, component, false, -1});
+      }
+      component_of[run] = component;
+      components_[component].size += end - begin;
+    }
+  }
+  for (Component& component : components_) {
+    // A parent is earlier, so that its own parent is a root by now.
+    component.parent = components_[component.parent].parent;
+    Component& first = components_[component.parent];
+    if (&first != &component) first.size += std::exchange(component.size, 0);
+  }
+}
+
+/// The components that become superpixels: all of at least `min_size` pixels, but as many of the
+/// largest as `lowest` and `highest` ask for; the earlier of equal ones.
+void RegionConnector::chooseKept(int min_size, int lowest, int highest) {
+  int large = 0, whole = 0;
+  for (Component& component : components_) {
+    component.kept = component.size >= min_size;
+    large += component.kept;
+    whole += component.size > 0;
+  }
+  const int wanted = std::min(std::max(large, lowest), std::min(highest, whole));
+  if (wanted == large) return;
+
+  std::vector<int> by_size;
+  for (int c = 0; c < static_cast<int>(components_.size()); ++c) {
+    if (components_[c].size > 0) by_size.push_back(c);
+  }
+  std::stable_sort(by_size.begin(), by_size.end(),
+                   [&](int a, int b) { return components_[a].size > components_[b].size; });
+  for (int i = 0; i < whole; ++i) components_[by_size[i]].kept = i < wanted;
+}
+
+/// The owner of a component that is not kept is that of its first pixel's left or else upper
+/// neighbour.
+void RegionConnector::joinSmall(const RunImage& image) {
+  // Those neighbours are in earlier components: one pass resolves all but what ends in a small
+  // component 0.
+  for (int c = 1; c < static_cast<int>(components_.size()); ++c) {
+    Component& component = components_[c];
+    if (component.size == 0 || component.kept) continue;
+    const int neighbour = image.runs[component.first_run].begin > 0
+                              ? component.first_run - 1
+                              : image.row_first[component.row - 1];
+    component.owner = components_[components_[component_of_run_[neighbour]].parent].owner;
+  }
+  if (components_[0].kept) return;
+
+  // The first contact of component 0's followers with a kept one decides for all of them.
+  int adopter = -1;
+  const auto owner = [&](int run) {
+    return components_[components_[component_of_run_[run]].parent].owner;
+  };
+  const auto consider = [&](int run_a, int run_b) {
+    const int a = owner(run_a), b = owner(run_b);
+    if (adopter < 0 && (a == 0) != (b == 0)) adopter = a == 0 ? b : a;
+  };
+  for (int y = 0; y < image.size.height; ++y) {
+    for (int run = image.row_first[y] + 1; run + 1 < image.row_first[y + 1]; ++run) {
+      consider(run - 1, run);
+    }
+  }
+  forEachVerticalContact(image, consider);
+  for (Component& component : components_) {
+    if (component.owner == 0) component.owner = adopter;
+  }
+}
+
+/// Writes the owners as ids in raster order of first appearance.
+SuperpixelMap RegionConnector::paint(const RunImage& image) {
+  SuperpixelMap map;
+  // Components are in that order themselves.
+  for (Component& component : components_) {
+    Component& first = components_[component.parent];
+    Component& owner = components_[first.owner];
+    if (owner.id < 0) {
+      owner.id = map.count++;
+      map.sizes.push_back(0);
+    }
+    map.sizes[owner.id] += component.size;
+    component.id = owner.id;
+  }
+
+  map.ids.create(image.size.height, image.size.width, CV_32SC1);
+  constexpr int kStep = 8;
+  int* const ids_end = map.ids.ptr<int>() + map.ids.total();
+  for (int y = 0; y < image.size.height; ++y) {
+    int* row = map.ids.ptr<int>(y);
+    // Whole steps may write beyond a run: what comes after it is written after it.
+    const bool room = ids_end - (row + image.size.width) >= kStep;
+    for (int run = image.row_first[y]; run + 1 < image.row_first[y + 1]; ++run) {
+      const int id = components_[component_of_run_[run]].id;
+      const int begin = image.runs[run].begin, end = image.runs[run + 1].begin;
+      if (room) {
+        for (int x = begin; x < end; x += kStep) {
+          for (int i = 0; i < kStep; ++i) row[x + i] = id;
+        }
+      } else {
+        std::fill(row + begin, row + end, id);
+      }
+    }
+  }
+  return map;
+}
+
+SuperpixelMap RegionConnector::connect(const RunImage& image, int wanted) {
+  const int lowest = wanted - wanted / 20, highest = wanted + wanted / 20;
+  const std::int64_t pixels = static_cast<std::int64_t>(image.size.width) * image.size.height;
+  findComponents(image);
+  chooseKept(static_cast<int>(std::max<std::int64_t>(1, pixels / wanted / 4)), lowest, highest);
+  joinSmall(image);
+  SuperpixelMap map = paint(image);
+  if (map.count >= lowest) return map;
+
+  while (map.count < lowest) {
     splitRegion(
         static_cast<int>(std::max_element(map.sizes.begin(), map.sizes.end()) - map.sizes.begin()),
         &map);

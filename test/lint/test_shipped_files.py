@@ -4,6 +4,7 @@
 import glob
 import os
 import re
+import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 
@@ -53,6 +54,54 @@ def test_files_that_launch_files_name_exist():
     for path in files("launch/**/*.launch"):
         for name in own.findall(text_of(path)):
             assert os.path.exists(os.path.join(SOURCE_DIR, name)), "%s: no %s" % (path, name)
+
+
+ARGUMENTS = ["rig:=config/kitti.yaml", "bag:=in.bag", "manager:=some_manager", "record:=out.bag"]
+
+
+def roslaunch(option, path, *arguments):
+    """What roslaunch, which resolves all arguments and includes for it, says of a launch file."""
+    result = subprocess.run(
+        ["/usr/bin/python3", shutil.which("roslaunch"), option, path] + list(arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        universal_newlines=True,
+        timeout=60,
+        cwd=SOURCE_DIR,
+        env=dict(os.environ, PWD=SOURCE_DIR),
+    )
+    assert result.returncode == 0, result.stdout
+    return result.stdout
+
+
+@pytest.mark.skipif(not shutil.which("roslaunch"), reason="roslaunch is not installed")
+@pytest.mark.parametrize("path", files("launch/*.launch"), ids=os.path.basename)
+def test_launch_files_load_with_every_argument_documented(path):
+    arguments = {a.get("name"): a for a in ET.parse(path).getroot().findall("arg")}
+    for name, argument in arguments.items():
+        assert argument.get("doc") or argument.get("value") is not None, "%s: no doc" % name
+    wanted = [a for a in ARGUMENTS if a.split(":=")[0] in arguments]
+    assert "/" in roslaunch("--nodes", path, "bond:=true", *wanted)
+    parameters = yaml.safe_load(roslaunch("--dump-params", path, "bond:=false", *wanted))
+    rigs = {value for key, value in parameters.items() if key.endswith("/rig_file")}
+    assert rigs and {os.path.basename(rig) for rig in rigs} == {"kitti.yaml"}
+
+
+@pytest.mark.skipif(not shutil.which("roslaunch"), reason="roslaunch is not installed")
+def test_fusion_launch_starts_the_network_only_if_asked():
+    path = os.path.join(SOURCE_DIR, "launch", "fusion.launch")
+    without = roslaunch("--nodes", path, ARGUMENTS[0]).split()
+    with_network = roslaunch("--nodes", path, ARGUMENTS[0], "segmentation:=true").split()
+    assert set(with_network) - set(without) == {"/segmentation"}
+    overrides = "/projection/overrides"
+    assert (
+        "segmentation.model="
+        in yaml.safe_load(roslaunch("--dump-params", path, ARGUMENTS[0]))[overrides]
+    )
+    parameters = yaml.safe_load(
+        roslaunch("--dump-params", path, ARGUMENTS[0], "segmentation:=true", "overrides:=a=1 b=2")
+    )
+    assert parameters[overrides] == "a=1 b=2"
 
 
 def test_plugin_descriptions_match_the_exports():

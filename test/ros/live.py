@@ -6,6 +6,7 @@ Every wait is for a condition and bounded; nothing here sleeps for a fixed time 
 import contextlib
 import hashlib
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -21,6 +22,7 @@ import rosbag
 import rosgraph
 import rospy
 from diagnostic_msgs.msg import DiagnosticArray
+from rosgraph_msgs.msg import Log
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SOURCE_DIR = os.path.dirname(os.path.dirname(HERE))
@@ -278,3 +280,26 @@ class Diagnostics:
 
     def close(self):
         self._subscriber.unregister()
+
+
+class Said:
+    """The lines of /rosout."""
+
+    def __init__(self):
+        self._lock = threading.Lock()
+        self._lines = []
+        self._subscriber = rospy.Subscriber("/rosout", Log, self._add, queue_size=1000)
+
+    def _add(self, message):
+        with self._lock:
+            self._lines.append((message.level, message.name, message.msg))
+
+    def find(self, pattern, level=Log.WARN):
+        """Lines at least as grave as `level` that match."""
+        with self._lock:
+            lines = list(self._lines)
+        return [line for line in lines if line[0] >= level and re.search(pattern, line[2])]
+
+    def wait_for(self, pattern, level=Log.WARN, timeout=20.0):
+        with_text = lambda: "a line like '%s'; said: %s" % (pattern, self._lines)  # noqa: E731
+        return wait_until(lambda: self.find(pattern, level), with_text, timeout)

@@ -15,11 +15,14 @@ ln -s "$SLF_SOURCE_DIR" "$workspace/src/$package"
 log=$SLF_BUILD_DIR/catkin_workspace.log
 # The devel space of the surrounding build must not serve here. A debug build also compiles what a
 # release build leaves out.
-env -u CMAKE_PREFIX_PATH -u ROS_PACKAGE_PATH -u PYTHONPATH -u LD_LIBRARY_PATH \
-  bash -c 'setup=/opt/ros/noetic/setup.bash; [ ! -f $setup ] || source $setup; exec "$@"' -- \
+(
+  unset CMAKE_PREFIX_PATH ROS_PACKAGE_PATH PYTHONPATH LD_LIBRARY_PATH
+  set +u
+  [ ! -f /opt/ros/noetic/setup.bash ] || source /opt/ros/noetic/setup.bash
   catkin_make -C "$workspace" -j"${SLF_JOBS:-2}" install -DCMAKE_BUILD_TYPE=Debug \
-  -DCATKIN_ENABLE_TESTING=OFF -DPYTHON_EXECUTABLE=/usr/bin/python3 \
-  -DPython3_EXECUTABLE=/usr/bin/python3 >"$log" 2>&1 ||
+    -DCATKIN_ENABLE_TESTING=OFF -DPYTHON_EXECUTABLE=/usr/bin/python3 \
+    -DPython3_EXECUTABLE=/usr/bin/python3
+) >"$log" 2>&1 ||
   fail "catkin_make failed: $(tail -15 "$log")"
 warnings=$(grep -E '(^|[^-])\bwarning:|CMake Warning' "$log" || true)
 [ -z "$warnings" ] || fail "catkin_make warns: $warnings"

@@ -23,8 +23,9 @@ class CameraSemantics {
   /// Tells the size of the scores, for maps of their size. An empty image is ignored.
   void noteScores(const cv::Mat& scores);
 
-  /// `image`: CV_8UC1 or CV_8UC3 (BGR). Throws DataError.
-  SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size);
+  /// `image`: CV_8UC1 or CV_8UC3 (BGR), taken at `stamp`; with `superpixels.warm_start` the result
+  /// depends on the image before, if it is recent. Throws DataError.
+  SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size, StampNs stamp);
 
   /// `scores` as in ScoreMap. Throws DataError.
   ShareMap share(const SuperpixelMap& superpixels, const cv::Mat& scores) const;

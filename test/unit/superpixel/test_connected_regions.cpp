@@ -3,25 +3,29 @@
 
 #include <string>
 
-#include "../../../src/superpixel/connected_regions.h"
 #include "map_properties.h"
+#include "superpixel/connected_regions.h"
 
 namespace semantic_lidar_fusion {
 namespace {
 
 RunImage toRuns(const cv::Mat& labels) {
-  RunImage runs;
-  runs.size = {labels.cols, labels.rows};
+  RunImage image;
+  image.size = {labels.cols, labels.rows};
+  image.row_first.push_back(0);
   for (int y = 0; y < labels.rows; ++y) {
-    runs.row_first.push_back(static_cast<int>(runs.begin.size()));
     for (int x = 0; x < labels.cols; ++x) {
       if (x > 0 && labels.at<int>(y, x) == labels.at<int>(y, x - 1)) continue;
-      runs.begin.push_back(x);
-      runs.label.push_back(labels.at<int>(y, x));
+      image.runs.push_back({x, labels.at<int>(y, x)});
     }
+    image.runs.push_back({labels.cols, -1});
+    image.row_first.push_back(static_cast<int>(image.runs.size()));
   }
-  runs.row_first.push_back(static_cast<int>(runs.begin.size()));
-  return runs;
+  return image;
+}
+
+SuperpixelMap connectedRegions(const cv::Mat& labels, int wanted) {
+  return RegionConnector().connect(toRuns(labels), wanted);
 }
 
 cv::Mat randomLabels(int width, int height, int label_count, unsigned seed) {
@@ -42,7 +46,7 @@ TEST(ConnectedRegions, HoldsTheCountForAnyLabels) {
         if (wanted < 1 || wanted > width * height) continue;
         SCOPED_TRACE(std::to_string(width) + "x" + std::to_string(height) + ", labels " +
                      std::to_string(label_count) + ", wanted " + std::to_string(wanted));
-        const SuperpixelMap map = connectedRegions(toRuns(labels), wanted);
+        const SuperpixelMap map = connectedRegions(labels, wanted);
         expectValidMap(map, width, height);
         expectCountWithinTenPercent(map.count, wanted);
       }
@@ -55,7 +59,7 @@ TEST(ConnectedRegions, KeepsRegionsThatFit) {
   for (int y = 0; y < 40; ++y) {
     for (int x = 0; x < 60; ++x) labels.at<int>(y, x) = 100 + (y / 20) * 3 + x / 20;
   }
-  const SuperpixelMap map = connectedRegions(toRuns(labels), 6);
+  const SuperpixelMap map = connectedRegions(labels, 6);
   ASSERT_EQ(map.count, 6);
   EXPECT_EQ(cv::norm(map.ids, labels - 100, cv::NORM_L1), 0.0);
 }
@@ -70,13 +74,13 @@ TEST(ConnectedRegions, JoinsSpecksToTheirSurroundings) {
   labels.at<int>(30, 50) = 77;
   labels.at<int>(0, 0) = 78;  // without a neighbour to the left or above
   labels.at<int>(0, 1) = 79;
-  const SuperpixelMap map = connectedRegions(toRuns(labels), 6);
+  const SuperpixelMap map = connectedRegions(labels, 6);
   ASSERT_EQ(map.count, 6);
   EXPECT_EQ(cv::norm(map.ids, clean, cv::NORM_L1), 0.0);
 }
 
 TEST(ConnectedRegions, SplitsIntoConnectedPartsNearHalf) {
-  const SuperpixelMap map = connectedRegions(toRuns(cv::Mat(32, 32, CV_32SC1, cv::Scalar(4))), 8);
+  const SuperpixelMap map = connectedRegions(cv::Mat(32, 32, CV_32SC1, cv::Scalar(4)), 8);
   expectValidMap(map, 32, 32);
   EXPECT_EQ(map.count, 8);
   // In a tree of degree 4 some cut leaves at least a quarter (less one node) on each side.

@@ -142,6 +142,109 @@ TEST(Slic, RefusesWhatItCannotCluster) {
   }
 }
 
+/// A window moving over a larger picture.
+cv::Mat movingView(const cv::Mat& world, int frame, int step) {
+  return world(cv::Rect(frame * step, frame * step / 2, 240, 160));
+}
+
+SlicConfig warmConfig() {
+  SlicConfig config = withCount(80);
+  config.warm_start = true;
+  return config;
+}
+
+constexpr ImageSize kView{240, 160};
+
+double maxAbsoluteDifference(const SuperpixelMap& a, const SuperpixelMap& b) {
+  return cv::norm(a.ids, b.ids, cv::NORM_INF);
+}
+
+TEST(SlicWarmStart, KeepsEveryPropertyOfTheMapWhileTheSceneMoves) {
+  const cv::Mat world = patchImage(500, 300, CV_8UC3, 12);
+  Slic slic(warmConfig());
+  for (int frame = 0; frame < 40; ++frame) {
+    SCOPED_TRACE(frame);
+    const SuperpixelMap map = slic.cluster(movingView(world, frame, 6), kView);
+    EXPECT_EQ(slic.startedWarm(), frame > 0);
+    expectValidMap(map, kView.width, kView.height);
+    expectCountWithinTenPercent(map.count, 80);
+  }
+}
+
+TEST(SlicWarmStart, DependsOnTheSequenceOfImagesAlone) {
+  const cv::Mat world = patchImage(500, 300, CV_8UC3, 13);
+  Slic first(warmConfig()), second(warmConfig());
+  for (int frame = 0; frame < 5; ++frame) {
+    const cv::Mat view = movingView(world, frame, 4);
+    const SuperpixelMap a = first.cluster(view, kView);
+    const SuperpixelMap b = second.cluster(view.clone(), kView, frame * kNsPerSecond / 10);
+    EXPECT_EQ(maxAbsoluteDifference(a, b), 0.0) << frame;
+  }
+}
+
+TEST(SlicWarmStart, IsOffUnlessAskedFor) {
+  const cv::Mat world = patchImage(500, 300, CV_8UC3, 14);
+  Slic slic(withCount(80));
+  const SuperpixelMap before = slic.cluster(movingView(world, 0, 5), kView);
+  slic.cluster(movingView(world, 1, 5), kView);
+  EXPECT_FALSE(slic.startedWarm());
+  EXPECT_EQ(maxAbsoluteDifference(slic.cluster(movingView(world, 0, 5), kView), before), 0.0);
+}
+
+// What follows must equal the map of a clusterer that has seen nothing.
+TEST(SlicWarmStart, FallsBackToColdWhereTheImageBeforeIsNoGuide) {
+  const cv::Mat world = patchImage(500, 300, CV_8UC3, 15);
+  const cv::Mat other_world = patchImage(500, 300, CV_8UC3, 16);
+  const cv::Mat view = movingView(world, 1, 4);
+  const SuperpixelMap cold = Slic(warmConfig()).cluster(view, kView);
+  const auto expect_cold = [&](Slic* slic, std::optional<StampNs> stamp, const char* why) {
+    const SuperpixelMap map = slic->cluster(view, kView, stamp);
+    EXPECT_FALSE(slic->startedWarm()) << why;
+    EXPECT_EQ(maxAbsoluteDifference(map, cold), 0.0) << why;
+  };
+  const StampNs t = 1000 * kNsPerSecond;
+  {
+    Slic slic(warmConfig());
+    slic.cluster(movingView(other_world, 0, 4), kView);
+    expect_cold(&slic, std::nullopt, "scene cut");
+  }
+  {
+    Slic slic(warmConfig());
+    slic.cluster(movingView(world, 0, 4), {120, 80});
+    expect_cold(&slic, std::nullopt, "another size");
+  }
+  {
+    Slic slic(warmConfig());
+    slic.cluster(patchImage(240, 160, CV_8UC1, 15), kView);
+    expect_cold(&slic, std::nullopt, "another number of channels");
+  }
+  {
+    Slic slic(warmConfig());
+    slic.cluster(movingView(world, 0, 4), kView);
+    slic.reset();
+    expect_cold(&slic, std::nullopt, "reset");
+  }
+  for (const StampNs later : {Slic::kMaxWarmGapNs + 1, StampNs{0}, StampNs{-1}}) {
+    Slic slic(warmConfig());
+    slic.cluster(movingView(world, 0, 4), kView, t);
+    expect_cold(&slic, t + later, "stamp");
+  }
+  Slic slic(warmConfig());
+  slic.cluster(movingView(world, 0, 4), kView, t);
+  slic.cluster(view, kView, t + Slic::kMaxWarmGapNs);
+  EXPECT_TRUE(slic.startedWarm());
+}
+
+TEST(SlicWarmStart, SurvivesImagesWithoutContent) {
+  Slic slic(warmConfig());
+  for (const int grey : {0, 0, 255, 3, 3}) {
+    const SuperpixelMap map =
+        slic.cluster(cv::Mat(kView.height, kView.width, CV_8UC3, cv::Scalar::all(grey)), kView);
+    expectValidMap(map, kView.width, kView.height);
+    expectCountWithinTenPercent(map.count, 80);
+  }
+}
+
 // On real photographs with human labels, the plain measure of how much superpixels straddle
 // segments is no worse than that of OpenCV's SLIC at the same number of superpixels.
 TEST(Slic, UndersegmentsCamvidNoMoreThanOpenCv) {
@@ -152,7 +255,7 @@ TEST(Slic, UndersegmentsCamvidNoMoreThanOpenCv) {
   double ours = 0.0, theirs = 0.0;
   int images = 0, our_count = 0, their_count = 0;
   const std::vector<std::string> names = camvidNames();
-  for (std::size_t i = 0; i < names.size(); i += 4) {
+  for (std::size_t i = 0; i < names.size(); i += 3) {
     const std::string& name = names[i];
     const cv::Mat image = cv::imread(sharedPath("data/camvid/" + name + ".png"));
     const cv::Mat truth =
@@ -167,7 +270,7 @@ TEST(Slic, UndersegmentsCamvidNoMoreThanOpenCv) {
     const int count = peer->getNumberOfSuperpixels();
     const SuperpixelMap map = clusterToCount(image, count);
     ASSERT_LE(map.count, count) << name;
-    ASSERT_GE(map.count, count - 3) << name;
+    ASSERT_GE(map.count, count * 99 / 100) << name;
     our_count += map.count;
     their_count += count;
     ours += undersegmentationError(map.ids, truth);

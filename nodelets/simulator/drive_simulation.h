@@ -1,0 +1,36 @@
+// SPDX-License-Identifier: MIT
+/// A drive through the street, written to a bag.
+#pragma once
+
+#include <cstdint>
+#include <string>
+
+namespace semantic_lidar_fusion {
+namespace simulator {
+
+struct SimulationOptions {
+  std::string output;
+  double duration_s = 2.0;
+  double speed_mps = 10.0;
+  std::uint64_t seed = 1;
+  double scale = 0.5;          ///< of 1920 x 1208 pixels
+  double camera_drop_m = 0.2;  ///< of the cameras below the lidar
+  double image_rate_hz = 30.0;
+  bool moving = true;  ///< other road users move
+  bool exact_odometry = false;
+  bool range_noise = true;
+  bool perfect_network = false;
+  bool all_images = false;  ///< else only those that a scan uses
+  bool raw_images = false;  ///< else JPEG
+  bool force = false;
+  bool quiet = false;
+  bool help = false;
+  int threads = 2;
+  std::string pictures;  ///< folder for PNG files of the first used image of each camera
+};
+
+/// `checkpoint` is called between steps and may throw. Throws Error; the output is then as before.
+void simulateDrive(const SimulationOptions& options, void (*checkpoint)());
+
+}  // namespace simulator
+}  // namespace semantic_lidar_fusion

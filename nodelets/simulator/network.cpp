@@ -1,0 +1,138 @@
+// SPDX-License-Identifier: MIT
+#include "network.h"
+
+#include <algorithm>
+#include <cmath>
+#include <opencv2/imgproc.hpp>
+#include <vector>
+
+#include "noise.h"
+#include "world.h"
+
+namespace semantic_lidar_fusion {
+namespace simulator {
+namespace {
+
+// In cells of the score grid.
+constexpr float kBorderShift = 1.2F;     ///< standard size of the borders' displacement
+constexpr float kBorderPatch = 5.0F;     ///< over which it stays alike
+constexpr double kBlurSigma = 0.7;       ///< of the borders
+constexpr float kConfusionPatch = 9.0F;  ///< size of patches of a wrong class
+constexpr float kGain = 10.5F;           ///< logit of a class that is all there is
+constexpr float kFineNoise = 0.7F, kPatchNoise = 1.6F;
+
+/// How often a patch of the first class is taken for the second.
+struct Confusion {
+  Class truth, other;
+  float share;
+};
+constexpr Confusion kConfusions[] = {
+    {Class::kBuilding, Class::kFence, 0.04F},
+    {Class::kBuilding, Class::kVegetation, 0.06F},
+    {Class::kBuilding, Class::kVehicle, 0.02F},
+    {Class::kPole, Class::kBuilding, 0.18F},
+    {Class::kPole, Class::kSign, 0.08F},
+    {Class::kPole, Class::kVegetation, 0.10F},
+    {Class::kRoad, Class::kUndrivableRoad, 0.02F},
+    {Class::kUndrivableRoad, Class::kRoad, 0.11F},
+    {Class::kUndrivableRoad, Class::kVegetation, 0.04F},
+    {Class::kVegetation, Class::kBuilding, 0.10F},
+    {Class::kVegetation, Class::kUndrivableRoad, 0.03F},
+    {Class::kSign, Class::kBuilding, 0.12F},
+    {Class::kSign, Class::kPole, 0.12F},
+    {Class::kFence, Class::kBuilding, 0.15F},
+    {Class::kFence, Class::kVegetation, 0.15F},
+    {Class::kVehicle, Class::kBuilding, 0.05F},
+    {Class::kVehicle, Class::kRoad, 0.015F},
+    {Class::kPedestrian, Class::kRider, 0.12F},
+    {Class::kPedestrian, Class::kBuilding, 0.08F},
+    {Class::kRider, Class::kPedestrian, 0.18F},
+    {Class::kRider, Class::kVehicle, 0.06F},
+    {Class::kUnlabeled, Class::kVehicle, 0.2F},
+    {Class::kUnlabeled, Class::kBuilding, 0.3F},
+};
+
+/// About normal, with patches of `size` cells.
+float patchNoise(float x, float y, float size, std::uint32_t key) {
+  const float sum = smoothNoise(x / size, y / size, key) +
+                    smoothNoise(x / size + 31.7F, y / size + 17.3F, key + 1U) - 1.0F;
+  return sum * 3.3F;  // the standard deviation of the sum is about 0.3
+}
+
+}  // namespace
+
+cv::Mat imitateNetwork(const cv::Mat& labels, const ImageSize& size, std::uint64_t key) {
+  const auto seed = static_cast<std::uint32_t>(mixBits(key));
+  const int cells = size.width * size.height;
+  const float scale_x = static_cast<float>(labels.cols) / static_cast<float>(size.width);
+  const float scale_y = static_cast<float>(labels.rows) / static_cast<float>(size.height);
+  std::vector<cv::Mat> evidence;
+  for (int c = 0; c < kClassCount; ++c)
+    evidence.push_back(cv::Mat::zeros(size.height, size.width, CV_32FC1));
+  constexpr int kSamples = 2;  // along each side of a cell
+  for (int row = 0; row < size.height; ++row) {
+    for (int column = 0; column < size.width; ++column) {
+      const float x = static_cast<float>(column), y = static_cast<float>(row);
+      const float shift_x = kBorderShift * patchNoise(x, y, kBorderPatch, seed + 11U);
+      const float shift_y = kBorderShift * patchNoise(x, y, kBorderPatch, seed + 13U);
+      for (int k = 0; k < kSamples * kSamples; ++k) {
+        const float sx = x + shift_x + (static_cast<float>(k % kSamples) + 0.5F) / kSamples;
+        const float sy = y + shift_y + (static_cast<float>(k / kSamples) + 0.5F) / kSamples;
+        const int u = std::min(std::max(static_cast<int>(sx * scale_x), 0), labels.cols - 1);
+        const int v = std::min(std::max(static_cast<int>(sy * scale_y), 0), labels.rows - 1);
+        int kind = labels.at<std::uint8_t>(v, u);
+        float offset = 0.0F;
+        for (const Confusion& confusion : kConfusions) {
+          if (static_cast<int>(confusion.truth) != kind) continue;
+          // One number, uniform over the picture in patches, divides the class's wrong answers.
+          const auto patch = seed + 101U * static_cast<std::uint32_t>(kind);
+          const float noise = patchNoise(x, y, kConfusionPatch, patch);
+          const float quantile = 0.5F + 0.5F * std::erf(noise / 1.414F);
+          if (quantile >= offset && quantile < offset + confusion.share) {
+            kind = static_cast<int>(confusion.other);
+            break;
+          }
+          offset += confusion.share;
+        }
+        evidence[static_cast<std::size_t>(kind)].at<float>(row, column) +=
+            1.0F / (kSamples * kSamples);
+      }
+    }
+  }
+  cv::Mat scores(size.height, size.width, CV_32FC(kClassCount));
+  for (int c = 0; c < kClassCount; ++c) {
+    const cv::Mat raw = evidence[static_cast<std::size_t>(c)].clone();
+    cv::GaussianBlur(raw, evidence[static_cast<std::size_t>(c)], cv::Size(5, 5), kBlurSigma,
+                     kBlurSigma, cv::BORDER_REPLICATE);
+  }
+  auto* score = scores.ptr<float>();
+  for (int cell = 0; cell < cells; ++cell) {
+    const int row = cell / size.width, column = cell % size.width;
+    const float x = static_cast<float>(column), y = static_cast<float>(row);
+    for (int c = 0; c < kClassCount; ++c) {
+      const float seen = evidence[static_cast<std::size_t>(c)].at<float>(row, column);
+      const auto channel = seed + 997U * static_cast<std::uint32_t>(c);
+      const float noise = kPatchNoise * patchNoise(x, y, 4.0F, channel) +
+                          kFineNoise * (latticeNoise(column, row, channel + 7U) - 0.5F) * 3.46F;
+      // In steps of 1/64: no less plausible, and the bag is smaller.
+      *score++ = std::round(64.0F * (kGain * std::sqrt(seen) + noise - 1.0F)) / 64.0F;
+    }
+  }
+  return scores;
+}
+
+cv::Mat perfectScores(const cv::Mat& labels) {
+  cv::Mat scores(labels.rows, labels.cols, CV_32FC(kClassCount));
+  for (int row = 0; row < labels.rows; ++row) {
+    auto* score = scores.ptr<float>(row);
+    const auto* label = labels.ptr<std::uint8_t>(row);
+    for (int column = 0; column < labels.cols; ++column, score += kClassCount) {
+      std::fill(score, score + kClassCount, 0.0F);
+      score[label[column]] = 10.0F;
+    }
+  }
+  return scores;
+}
+
+}  // namespace simulator
+}  // namespace semantic_lidar_fusion

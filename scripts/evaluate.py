@@ -1,0 +1,147 @@
+#!/usr/bin/python3
+# SPDX-License-Identifier: MIT
+"""Scores semantic clouds against truth: the paper's Table I for direct projection, with motion
+correction, and with motion correction and occlusion mask."""
+
+import argparse
+import os
+import sys
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+
+from semantic_lidar_fusion import cli  # noqa: E402
+
+EPILOG = """\
+The truth is the topic /points_truth (PointCloud2: x y z, label u8 = class id; the same points in the
+same order as the scan); simulate_drive and import_dataset.py write it. Written to --out: report.md,
+table1.csv, summary.csv, confusion_*.csv, visibility.csv, temperatures.csv, and PNG plots.
+
+  evaluate.py drive.bag --rig rig.yaml --out results
+  evaluate.py drive.bag --rig rig.yaml --clouds online=recorded.bag --out results
+  evaluate.py drive.bag --rig rig.yaml --fit-temperature --fit-on other.bag --out results
+  evaluate.py --images camvid --model enet.yaml --classes classes.yaml --fit-temperature --out results
+"""
+
+
+def make_parser():
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("bag", metavar="IN.bag", nargs="?", help="a drive with points_truth")
+    parser.add_argument("--rig", metavar="FILE", help="the rig file of the drive")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        default="evaluation",
+        help="folder of the results (default: evaluation)",
+    )
+    parser.add_argument(
+        "--clouds",
+        metavar="NAME=BAG",
+        action="append",
+        default=[],
+        help="score the clouds of this bag instead of running fuse_bag; repeatable, in the order "
+        "of the table's columns",
+    )
+    parser.add_argument("--truth", metavar="BAG", help="bag with points_truth (default: IN.bag)")
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        dest="settings",
+        help="override a key of the rig file in all runs; repeatable",
+    )
+    parser.add_argument(
+        "--min-edge-px",
+        metavar="PX",
+        type=_not_negative,
+        default=0.0,
+        help="score only points further than this from a class edge in the image (the truth's field "
+        "edge_px)",
+    )
+    parser.add_argument(
+        "--fit-temperature",
+        action="store_true",
+        help="compare raw softmax, share temperature, one fitted constant, and both: fitted to the "
+        "even scans, reported on the odd ones",
+    )
+    parser.add_argument(
+        "--fit-on",
+        metavar="BAG",
+        help="fit to this bag with truth instead, report on all of IN.bag",
+    )
+    parser.add_argument(
+        "--images",
+        metavar="DIR",
+        help="instead of a drive: images NAME.* with label images NAME_annot.png (class ids)",
+    )
+    parser.add_argument("--model", metavar="FILE", help="the network for --images")
+    parser.add_argument("--classes", metavar="FILE", help="the class set of --images")
+    parser.add_argument(
+        "--label-suffix", metavar="TEXT", default="_annot", help="of label images (default: _annot)"
+    )
+    parser.add_argument(
+        "--pixel-step",
+        metavar="N",
+        type=_positive,
+        default=2,
+        help="score every N-th pixel in both directions (default: 2)",
+    )
+    parser.add_argument("--fuse-bag", metavar="FILE", help="the program (default: looked for)")
+    parser.add_argument("--keep-bags", action="store_true", help="keep the fused bags in --out")
+    parser.add_argument("--force", action="store_true", help="replace earlier results in --out")
+    return parser
+
+
+def _not_negative(text):
+    value = float(text)
+    if not value >= 0:
+        raise argparse.ArgumentTypeError("must not be negative")
+    return value
+
+
+def _positive(text):
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be positive")
+    return value
+
+
+def check(parser, options):
+    """Leaves with exit code 2 unless the options fit together."""
+    if bool(options.bag) == bool(options.images):
+        parser.error("give IN.bag or --images, one of them")
+    if options.images:
+        for name in ("model", "classes"):
+            if not getattr(options, name):
+                parser.error("--images needs --" + name)
+        for name in ("rig", "truth", "clouds", "fit_on"):
+            if getattr(options, name):
+                parser.error("--images and --%s exclude each other" % name.replace("_", "-"))
+    elif not options.rig and not options.clouds:
+        parser.error("give --rig, or --clouds of existing bags")
+    if options.clouds and options.fit_temperature:
+        parser.error("--fit-temperature runs fuse_bag; it has no use for --clouds")
+    if options.fit_on and not options.fit_temperature:
+        parser.error("--fit-on needs --fit-temperature")
+    names = [text.partition("=")[0] for text in options.clouds]
+    for text, name in zip(options.clouds, names):
+        if not name or not text.partition("=")[2] or not name.replace("_", "").isalnum():
+            parser.error("--clouds %s: must be NAME=BAG, NAME of letters, digits and _" % text)
+        if names.count(name) > 1:
+            parser.error("--clouds %s: the name occurs twice" % name)
+
+
+def main():
+    parser = make_parser()
+    options = parser.parse_args()
+    check(parser, options)
+    cli.require("numpy", "yaml", "rosbag", "matplotlib")
+    from semantic_lidar_fusion import evaluation_run
+
+    print(evaluation_run.evaluate(options))
+
+
+if __name__ == "__main__":
+    cli.run(main)

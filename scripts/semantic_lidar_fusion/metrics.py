@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: MIT
+"""Scores of labelled points: confusion matrices and the calibration of distributions.
+
+`row` is a class of the evaluation's tables (labels.LabelSet.evaluation_classes), R of them;
+labels.NO_LABEL marks what has none. All classes add up scan by scan, so that a drive of any length
+needs the memory of one scan. A quotient without a denominator is NaN.
+"""
+
+from typing import List
+
+import numpy as np
+
+from semantic_lidar_fusion.labels import NO_LABEL
+
+ECE_BINS = 15
+MIN_PROBABILITY = 1e-12  # where the NLL is clipped
+
+
+def ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    """numerator / denominator in float64, NaN where the denominator is 0."""
+    numerator, denominator = np.broadcast_arrays(
+        np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
+    )
+    result = np.full(numerator.shape, np.nan)
+    np.divide(numerator, denominator, out=result, where=denominator != 0)
+    return result
+
+
+class Confusion:
+    """Counts of points by true and predicted row.
+
+    matrix: (R, R + 1) int64; [i, j] = points of row i taken for row j; the last column counts
+    predictions of a discarded class, which are misses of the true row and hits on no other.
+    """
+
+    def __init__(self, rows: int):
+        self.matrix = np.zeros((rows, rows + 1), dtype=np.int64)
+
+    def add(self, truth: np.ndarray, predicted: np.ndarray) -> None:
+        """truth, predicted: (N,) rows. Points without a true row are left out."""
+        rows = len(self.matrix)
+        kept = truth != NO_LABEL
+        first = truth[kept].astype(np.int64)
+        second = np.where(predicted[kept] == NO_LABEL, rows, predicted[kept]).astype(np.int64)
+        cells = np.bincount(first * (rows + 1) + second, minlength=rows * (rows + 1))
+        self.matrix += cells.reshape(rows, rows + 1)
+
+    @property
+    def support(self) -> np.ndarray:
+        """(R,) points of each true row."""
+        return self.matrix.sum(axis=1)
+
+    @property
+    def hits(self) -> np.ndarray:
+        """(R,) points of each row that were taken for it."""
+        return np.diagonal(self.matrix)
+
+    @property
+    def recall(self) -> np.ndarray:
+        """(R,) hits / points of the true row."""
+        return ratio(self.hits, self.support)
+
+    @property
+    def precision(self) -> np.ndarray:
+        """(R,) hits / points taken for the row."""
+        return ratio(self.hits, self.matrix[:, :-1].sum(axis=0))
+
+    @property
+    def f1(self) -> np.ndarray:
+        """(R,) 2 hits / (points of the row + points taken for it); NaN without points of it."""
+        both = self.support + self.matrix[:, :-1].sum(axis=0)
+        return np.where(self.support > 0, ratio(2 * self.hits, both), np.nan)
+
+    @property
+    def total(self) -> int:
+        return int(self.matrix.sum())
+
+    @property
+    def accuracy(self) -> float:
+        return float(ratio(self.hits.sum(), self.total))
+
+
+class Reliability:
+    """How far distributions over the rows can be believed.
+
+    NLL: mean of -ln P(true row), P clipped at 1e-12, nats. Brier: mean of sum_r (P(r) - [r true])^2.
+    ECE: sum over 15 equal bins (lower, upper] of confidence of (points in it / all points) * |mean
+    confidence - share that is right|. The confidence is the probability of the predicted row, or of
+    the class where that is a discarded one (which is never right). Probability on discarded classes
+    belongs to no row, so that rows may add up to less than 1.
+    """
+
+    def __init__(self, bins: int = ECE_BINS):
+        self.count = np.zeros(bins, dtype=np.int64)
+        self.confidence_sum = np.zeros(bins)
+        self.right_count = np.zeros(bins, dtype=np.int64)
+        self._log_loss = 0.0
+        self._brier = 0.0
+
+    def add(
+        self,
+        probabilities: np.ndarray,
+        truth: np.ndarray,
+        predicted: np.ndarray,
+        confidence: np.ndarray,
+    ) -> None:
+        """probabilities: (N, R) of the rows; truth, predicted: (N,) rows; confidence: (N,). Points
+        without a true row are left out."""
+        kept = truth != NO_LABEL
+        truth, predicted, confidence = truth[kept], predicted[kept], confidence[kept]
+        values = probabilities[kept].astype(np.float64)
+        index = np.arange(len(truth))
+        of_truth = values[index, truth]
+        self._log_loss -= float(np.log(np.clip(of_truth, MIN_PROBABILITY, None)).sum())
+        values[index, truth] -= 1.0
+        self._brier += float(np.square(values).sum())
+        bins = len(self.count)
+        place = np.clip(np.ceil(confidence.astype(np.float64) * bins) - 1, 0, bins - 1).astype(int)
+        self.count += np.bincount(place, minlength=bins)
+        self.confidence_sum += np.bincount(place, weights=confidence, minlength=bins)
+        self.right_count += np.bincount(place[predicted == truth], minlength=bins)
+
+    @property
+    def total(self) -> int:
+        return int(self.count.sum())
+
+    @property
+    def nll(self) -> float:
+        return float(ratio(self._log_loss, self.total))
+
+    @property
+    def brier(self) -> float:
+        return float(ratio(self._brier, self.total))
+
+    @property
+    def mean_confidence(self) -> np.ndarray:
+        """(bins,)."""
+        return ratio(self.confidence_sum, self.count)
+
+    @property
+    def accuracy(self) -> np.ndarray:
+        """(bins,) share of points that are right."""
+        return ratio(self.right_count, self.count)
+
+    @property
+    def ece(self) -> float:
+        gap = np.abs(self.confidence_sum - self.right_count).sum()
+        return float(ratio(gap, self.total))
+
+
+class Visibility:
+    """What an occlusion mask does to the pairs of a point and a camera in whose image it lies.
+
+    Bit i of each (N,) integer array stands for camera i. Without a `catchable` truth its counts stay
+    None.
+    """
+
+    def __init__(self) -> None:
+        self.hidden = self.hidden_caught = 0
+        self.seen = self.seen_lost = 0
+        self.catchable = self.catchable_caught = 0
+        self.has_catchable = False
+
+    def add(
+        self,
+        unmasked: np.ndarray,
+        masked: np.ndarray,
+        visible: np.ndarray,
+        catchable: np.ndarray = None,
+    ) -> None:
+        """unmasked, masked: cameras that contributed without and with the mask; visible: cameras
+        that really see the point; catchable: hidden from the camera by something that the lidar
+        has measured beside the line of sight."""
+        lost = unmasked & ~masked
+        hidden = unmasked & ~visible
+        seen = unmasked & visible
+        self.hidden += _bits(hidden)
+        self.hidden_caught += _bits(hidden & lost)
+        self.seen += _bits(seen)
+        self.seen_lost += _bits(seen & lost)
+        if catchable is not None:
+            self.has_catchable = True
+            self.catchable += _bits(hidden & catchable)
+            self.catchable_caught += _bits(hidden & catchable & lost)
+
+    def rows(self) -> List[list]:
+        """[what, points, share] for a table."""
+        result = [
+            ["hidden points caught", self.hidden, float(ratio(self.hidden_caught, self.hidden))]
+        ]
+        if self.has_catchable:
+            share = float(ratio(self.catchable_caught, self.catchable))
+            result.append(["catchable hidden points caught", self.catchable, share])
+        result.append(["visible points lost", self.seen, float(ratio(self.seen_lost, self.seen))])
+        return result
+
+
+def _bits(values: np.ndarray) -> int:
+    """Number of set bits of a (N,) array of 16-bit flags."""
+    flags = np.ascontiguousarray(values.astype("<u2"))
+    return int(np.unpackbits(flags.view(np.uint8)).sum())

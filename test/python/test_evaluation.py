@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: MIT
+"""evaluate.py on a drive of exactly known truth, on clouds made by hand, and on bad input."""
+import csv
+import os
+
+import numpy as np
+import pytest
+
+bag_factory = pytest.importorskip("bag_factory")
+import rosbag  # noqa: E402
+
+from bag_factory import START_NS, Drive  # noqa: E402
+from semantic_lidar_fusion import evaluation, image_truth  # noqa: E402
+from semantic_lidar_fusion.bag_io import BagWriter  # noqa: E402
+from semantic_lidar_fusion.cloud_io import from_array, point_dtype  # noqa: E402
+from semantic_lidar_fusion.errors import ConfigError, DataError  # noqa: E402
+from semantic_lidar_fusion.labels import NO_LABEL, LabelSet  # noqa: E402
+
+NAMES = ["road", "wall", "door", "sky"]
+RIG_CLASSES = "classes:\n  classes:\n" + "".join(
+    "  - {name: %s, color: [%d, 2, 3]}\n" % (name, i) for i, name in enumerate(NAMES)
+)
+MERGE = "  evaluation: {discard: [sky], merge: {wall: [wall, door]}}\n"
+
+
+def cloud(label, status=None, probabilities=None, cameras=None, stamp_ns=START_NS, shift=0.0):
+    """A points_semantic message whose points lie in a row."""
+    label = np.asarray(label, dtype=np.uint8)
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "u1"), ("cameras", "u2")]
+    fields += [("status", "u1")] + [("p_" + name, "f4") for name in NAMES]
+    points = np.zeros(len(label), dtype=point_dtype(fields))
+    points["x"] = np.arange(len(label)) + shift
+    points["label"] = label
+    points["status"] = 0 if status is None else status
+    points["cameras"] = 1 if cameras is None else cameras
+    for i, name in enumerate(NAMES):
+        one = (label == i).astype(np.float32) if probabilities is None else probabilities[:, i]
+        points["p_" + name] = one
+    return from_array(points, stamp_ns, "velodyne")
+
+
+def truth_cloud(label, stamp_ns=START_NS, **extra):
+    label = np.asarray(label)
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", label.dtype.str)]
+    fields += [(name, np.asarray(values).dtype.str) for name, values in extra.items()]
+    points = np.zeros(len(label), dtype=point_dtype(fields))
+    points["x"] = np.arange(len(label))
+    points["label"] = label
+    for name, values in extra.items():
+        points[name] = values
+    return from_array(points, stamp_ns, "velodyne")
+
+
+def write(path, topic, *messages):
+    with BagWriter(str(path), "none") as bag:
+        for message in messages:
+            bag.write(topic, message, message.header.stamp.to_nsec())
+    return path
+
+
+def bytes_of(*labels):
+    return np.array(labels, dtype=np.uint8)
+
+
+@pytest.fixture
+def rig(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(RIG_CLASSES + MERGE)
+    return path
+
+
+def table(folder, name="table1.csv"):
+    with open(os.path.join(str(folder), name)) as file:
+        return list(csv.DictReader(file))
+
+
+def test_scores_by_hand(rig, run_command, tmp_path):
+    # road right; wall taken for door is right after merging; door taken for sky is a miss; sky is
+    # left out; no truth is left out; an occluded point does not count.
+    truth = bytes_of(0, 1, 2, 3, NO_LABEL, 0, 0)
+    fused = bytes_of(0, 2, 3, 0, 1, 255, 1)
+    made = write(
+        tmp_path / "a.bag", "/points_semantic", cloud(fused, bytes_of(0, 0, 0, 0, 0, 1, 0))
+    )
+    known = write(tmp_path / "t.bag", "/points_truth", truth_cloud(truth))
+    out = tmp_path / "out"
+    code, text, err = run_command(
+        "evaluate.py", known, "--rig", rig, "--clouds", "mine=%s" % made, "--out", out
+    )
+    assert code == 0, err
+    rows = {row["class"]: row for row in table(out)}
+    assert set(rows) == {"road", "wall"}
+    assert float(rows["road"]["recall"]) == pytest.approx(1 / 2)
+    assert float(rows["road"]["precision"]) == 1.0
+    assert float(rows["wall"]["recall"]) == pytest.approx(1 / 2)
+    assert float(rows["wall"]["precision"]) == pytest.approx(1 / 2)
+    assert [int(rows[name]["points"]) for name in ("road", "wall")] == [2, 2]
+    (counts,) = table(out, "summary.csv")
+    assert (counts["points"], counts["labelled"], counts["occluded"]) == ("7", "6", "1")
+    assert (counts["without_truth"], counts["scored"]) == ("2", "4")
+    # Two of four right, each with all its confidence on the prediction.
+    assert float(counts["ece"]) == pytest.approx(0.5)
+    assert float(counts["nll"]) == pytest.approx(2 * 12 * np.log(10) / 4)
+    with open(str(out / "confusion_mine.csv")) as file:
+        assert file.read() == "truth,road,wall,(discarded)\nroad,1,1,0\nwall,0,1,1\n"
+    for name in ("f1.png", "confusion.png", "reliability.png", "report.md"):
+        assert os.path.getsize(str(out / name)) > 100
+    assert "| Road" in text
+    code, _, err = run_command("evaluate.py", known, "--clouds", "mine=%s" % made, "--out", out)
+    assert code == 1 and "--force" in err
+
+
+def test_argmax_comes_before_merging(rig, run_command, tmp_path):
+    # Wall and door together outweigh road, but road is the most likely class.
+    probabilities = np.array([[0.4, 0.3, 0.3, 0.0]])
+    made = write(
+        tmp_path / "a.bag", "/points_semantic", cloud(bytes_of(0), probabilities=probabilities)
+    )
+    known = write(tmp_path / "t.bag", "/points_truth", truth_cloud(bytes_of(0)))
+    options = ("--rig", rig, "--clouds", "mine=%s" % made, "--out", tmp_path / "out")
+    assert run_command("evaluate.py", known, *options)[0] == 0
+    (counts,) = table(tmp_path / "out", "summary.csv")
+    assert float(counts["accuracy"]) == 1.0
+    assert float(counts["nll"]) == pytest.approx(-np.log(0.4), abs=1e-5)
+    assert float(counts["brier"]) == pytest.approx(0.36 + 0.36, abs=1e-5)
+    assert float(counts["ece"]) == pytest.approx(0.6, abs=1e-5)
+
+
+def test_visibility_and_share_removed(rig, run_command, tmp_path):
+    label = bytes_of(0, 0, 0, 0)
+    bits = [np.array(b, dtype=np.uint16) for b in ([1, 3, 1, 2], [0, 1, 1, 2])]
+    known = write(
+        tmp_path / "t.bag",
+        "/points_truth",
+        truth_cloud(
+            label,
+            visible=np.array([0, 3, 1, 0], np.uint16),
+            catchable=np.array([1, 0, 0, 0], np.uint16),
+            edge_px=np.array([0.5, 2.0, 3.0, 1.0], np.float32),
+        ),
+    )
+    direct = write(tmp_path / "a.bag", "/points_semantic", cloud(label, cameras=bits[0]))
+    masked = write(
+        tmp_path / "b.bag", "/points_semantic", cloud(label, bytes_of(1, 0, 0, 0), cameras=bits[1])
+    )
+    clouds = ("--clouds", "direct=%s" % direct, "--clouds", "mask=%s" % masked, "--rig", rig)
+    assert run_command("evaluate.py", known, *clouds, "--out", tmp_path / "out")[0] == 0
+    rates = {
+        row["what"]: (row["points"], row["share"])
+        for row in table(tmp_path / "out", "visibility.csv")
+    }
+    assert rates == {
+        "hidden points caught": ("2", "0.500000"),
+        "catchable hidden points caught": ("1", "1.000000"),
+        "visible points lost": ("3", "0.333333"),
+    }
+    counts = table(tmp_path / "out", "summary.csv")
+    assert counts[0]["removed_by_mask"] == "" and float(counts[1]["removed_by_mask"]) == 0.25
+    run_command("evaluate.py", known, *clouds, "--out", tmp_path / "far", "--min-edge-px", "1.5")
+    assert [row["scored"] for row in table(tmp_path / "far", "summary.csv")] == ["2", "2"]
+
+
+def add_truth(bag, drive):
+    """points_truth from the room itself: each point's class where and when it was measured."""
+    with rosbag.Bag(str(bag), "a") as writer:
+        for index in range(drive.scans):
+            points, _, time_ns = drive.scan_points(index)
+            start_ns = drive.scan_start_ns(index)
+            poses = drive.poses((start_ns - START_NS + time_ns) * 1e-9) @ drive.lidar_pose
+            world = np.einsum("nij,nj->ni", poses[:, :3, :3], points) + poses[:, :3, 3]
+            kind = point_dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("label", "u1")])
+            known = np.zeros(len(points), dtype=kind)
+            known["x"], known["y"], known["z"] = points.T
+            known["label"] = drive.class_of(world)
+            message = from_array(known, start_ns, "velodyne")
+            writer.write("/points_truth", message, message.header.stamp)
+
+
+def has_program():
+    return os.path.exists(os.path.join(os.environ.get("SLF_BIN_DIR", ""), "fuse_bag"))
+
+
+needs_program = pytest.mark.skipif(not has_program(), reason="fuse_bag is not built (SLF_BIN_DIR)")
+
+
+@needs_program
+def test_motion_correction_shows_in_the_table(run_command, tmp_path):
+    # A fast turn: without correction, points near the edges of doors and walls miss their class.
+    drive = Drive(scans=4, speed=12.0, yaw_rate=1.5)
+    bag, path = tmp_path / "in.bag", tmp_path / "rig.yaml"
+    bag_factory.write_bag(str(bag), drive)
+    add_truth(bag, drive)
+    path.write_text(bag_factory.rig_text(drive))
+    out = tmp_path / "out"
+    code, text, err = run_command(
+        "evaluate.py", bag, "--rig", path, "--out", out, "--fit-temperature", "--keep-bags"
+    )
+    assert code == 0, err
+    counts = table(out, "summary.csv")
+    assert [row["configuration"] for row in counts] == ["direct", "motion", "motion_mask"]
+    assert [row["scans"] for row in counts] == ["4", "4", "4"]
+    f1 = {(row["class"], row["configuration"]): row["f1"] for row in table(out)}
+    for name in ("wall", "door"):
+        assert float(f1[name, "motion"]) > float(f1[name, "direct"]) + 0.01
+    assert float(counts[1]["accuracy"]) > 0.98
+    results = {row["tau"]: row for row in table(out, "temperatures.csv")}
+    assert list(results) == ["raw", "share", "constant", "combined"]
+    assert float(results["raw"]["exponent"]) == 0 and float(results["share"]["exponent"]) == 2
+    # Scores of a network that is almost never wrong but unsure: sharper is better.
+    assert float(results["constant"]["temperature"]) < 1
+    assert float(results["constant"]["nll"]) < float(results["raw"]["nll"])
+    assert float(results["combined"]["nll"]) < float(results["share"]["nll"])
+    assert {"direct.bag", "motion.bag", "motion_mask.bag"} <= set(os.listdir(str(out)))
+    assert not [name for name in os.listdir(str(out)) if name.startswith(".")]
+
+
+@needs_program
+def test_a_failing_fuse_bag_is_reported(rig, run_command, tmp_path):
+    known = write(tmp_path / "t.bag", "/points_truth", truth_cloud(bytes_of(0)))
+    code, _, err = run_command("evaluate.py", known, "--rig", rig, "--out", tmp_path / "out")
+    assert code == 1 and "fuse_bag failed" in err
+    assert os.listdir(str(tmp_path / "out")) == []
+
+
+@pytest.mark.parametrize(
+    "truth, message",
+    [
+        (truth_cloud(bytes_of(0, 1, 2)), "2 points, its truth 3"),
+        (truth_cloud(bytes_of(0, 9)), "label 9; must be below the 4 classes"),
+        (truth_cloud(np.array([0, 1], np.uint16)), "must be uint8"),
+        (truth_cloud(bytes_of(0, 1), START_NS + 10**9), "no scan within 0.15 s"),
+    ],
+)
+def test_truth_that_does_not_fit_is_refused(rig, run_command, tmp_path, truth, message):
+    made = write(tmp_path / "a.bag", "/points_semantic", cloud(bytes_of(0, 1)))
+    known = write(tmp_path / "t.bag", "/points_truth", truth)
+    code, _, err = run_command(
+        "evaluate.py", known, "--rig", rig, "--clouds", "mine=%s" % made, "--out", tmp_path / "out"
+    )
+    assert code == 1 and message in err
+
+
+def test_another_order_of_points_is_refused(rig, run_command, tmp_path):
+    made = write(tmp_path / "a.bag", "/points_semantic", cloud(bytes_of(0, 1), shift=10.0))
+    known = write(tmp_path / "t.bag", "/points_truth", truth_cloud(bytes_of(0, 1)))
+    code, _, err = run_command(
+        "evaluate.py", known, "--rig", rig, "--clouds", "mine=%s" % made, "--out", tmp_path / "out"
+    )
+    assert code == 1 and "another order" in err
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ((), "give IN.bag or --images"),
+        (("a.bag",), "give --rig"),
+        (("a.bag", "--rig", "r", "--fit-on", "b.bag"), "--fit-on needs"),
+        (("a.bag", "--clouds", "x"), "must be NAME=BAG"),
+        (("--images", "d", "--model", "m"), "--images needs --classes"),
+    ],
+)
+def test_options_that_do_not_fit_together(run_command, arguments, message):
+    code, _, err = run_command("evaluate.py", *arguments)
+    assert code == 2 and message in err
+
+
+def test_pairs_of_scans_and_truth():
+    ms = 10**6
+    pair = evaluation.pair_scans
+    # As many of both: in order, even where the stamp tells another moment of the scan.
+    assert pair([100 * ms, 200 * ms], [0, 100 * ms]) == [0, 1]
+    # A few labelled scans of many; a scan without truth nearby.
+    assert pair([200 * ms], [0, 100 * ms, 201 * ms, 300 * ms]) == [-1, -1, 0, -1]
+    assert pair([0, 100 * ms, 200 * ms], [101 * ms]) == [1]
+    assert pair([0, 10**9], [500 * ms]) == [-1]
+
+
+def test_configurations_follow_the_rig(tmp_path):
+    def names(text, *settings):
+        path = tmp_path / "r.yaml"
+        path.write_text(RIG_CLASSES + text)
+        return [c.name for c in evaluation.Rig(str(path), settings).configurations()]
+
+    assert names("") == ["direct", "motion", "motion_mask"]
+    assert names("motion: {enabled: false}\n") == ["direct", "mask"]
+    assert names("occlusion: {mode: off}\n") == ["direct", "motion"]
+    assert names("", "occlusion.mode=off") == ["direct", "motion"]
+    with pytest.raises(ConfigError, match="KEY=VALUE"):
+        names("", "occlusion.mode")
+
+
+def test_labelled_images_become_points_on_their_pixels(tmp_path):
+    import cv2
+
+    from semantic_lidar_fusion.bag_io import BagReader
+    from semantic_lidar_fusion.cloud_io import to_array
+
+    random = np.random.RandomState(1)
+    labels = random.randint(0, 6, (12, 16)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), random.randint(0, 255, (12, 16, 3)).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "a_annot.png"), labels)
+    images = image_truth.find_images(str(tmp_path), "_annot")
+    assert [os.path.basename(entry.image) for entry in images] == ["a.png"]
+    classes = LabelSet.from_tree([{"name": n, "color": [1, 2, 3]} for n in NAMES], "classes")
+    paths = [str(tmp_path / name) for name in ("o.bag", "o.yaml")]
+    image_truth.write_bag(images, classes, "m.yaml", 3, *paths)
+    assert evaluation.Rig(paths[1]).labels == classes
+    with BagReader(paths[0]) as bag:
+        (truth,) = [to_array(item.message) for item in bag.read(["/points_truth"])]
+        (info,) = [item.message for item in bag.read(["/camera/camera_info"])]
+    u = info.K[0] * truth["x"] / truth["z"] + info.K[2]
+    v = info.K[4] * truth["y"] / truth["z"] + info.K[5]
+    np.testing.assert_allclose(u.reshape(4, 5), np.tile([1, 4, 7, 10, 13], (4, 1)), atol=1e-4)
+    np.testing.assert_allclose(v.reshape(4, 5)[:, 0], [1, 4, 7, 10], atol=1e-4)
+    expected = labels[1::3, 1::3][:, :5].ravel()
+    np.testing.assert_array_equal(truth["label"], np.where(expected < 4, expected, NO_LABEL))
+    with pytest.raises(DataError, match="no image"):
+        image_truth.find_images(str(tmp_path), "_other")
+
+
+@needs_program
+def test_rellis_table(optional_data, run_command, tmp_path):
+    folder = optional_data("data/rellis3d_000104")
+    bag, path = tmp_path / "in.bag", tmp_path / "in.yaml"
+    code, _, err = run_command(
+        "import_dataset.py", "rellis", folder, bag, "--scores", "onehot", "--score-stride", 1
+    )
+    assert code == 0, err
+    code, _, err = run_command("evaluate.py", bag, "--rig", path, "--out", tmp_path / "out")
+    assert code == 0, err
+    counts = table(tmp_path / "out", "summary.csv")
+    assert [row["configuration"] for row in counts] == ["direct", "mask"]
+    assert counts[0]["labelled"] == "7429"
+    assert float(counts[0]["accuracy"]) == pytest.approx(0.773, abs=0.001)
+    precision = {
+        (row["class"], row["configuration"]): float(row["precision"] or "nan")
+        for row in table(tmp_path / "out")
+    }
+    # The mask drops points behind the person that had her label.
+    assert precision["person", "mask"] > precision["person", "direct"] + 0.05

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: MIT
+"""The simulated drive against itself: packets, truth, pictures, poses, and the same bytes twice."""
+
+import os
+import struct
+import subprocess
+
+import numpy as np
+import pytest
+
+rosbag = pytest.importorskip("rosbag")
+
+from semantic_lidar_fusion import cloud_io  # noqa: E402
+
+PROGRAM = os.path.join(os.environ.get("SLF_BIN_DIR", ""), "simulate_drive")
+pytestmark = pytest.mark.skipif(
+    not os.access(PROGRAM, os.X_OK), reason="simulate_drive is not built (Embree 3 is absent)"
+)
+
+CAMERAS = ("A0", "A1", "A2", "B0", "B1")
+DECLARED = 12  # classes
+QUANTUM_M = 0.002
+# VLP-16 manual, table 9-1: elevation of each laser in firing order.
+ELEVATIONS_DEG = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
+
+
+def simulate(path, *options):
+    return subprocess.run(
+        [PROGRAM, "--out", str(path), "--quiet"] + list(options), capture_output=True, text=True
+    )
+
+
+@pytest.fixture(scope="module")
+def exact_bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp("drive") / "exact.bag"
+    done = simulate(path, "--duration", "0.3", "--scale", "0.2", "--exact")
+    assert done.returncode == 0, done.stderr
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def noisy_bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp("drive") / "noisy.bag"
+    done = simulate(path, "--duration", "0.3", "--scale", "0.2", "--seed", "3")
+    assert done.returncode == 0, done.stderr
+    return str(path)
+
+
+def read(bag, topic):
+    with rosbag.Bag(bag) as opened:
+        return [message for _, message, _ in opened.read_messages([topic])]
+
+
+def ranges_of(scan):
+    """Ranges (m) and elevations (deg) of a VelodyneScan's returns in the order of their data."""
+    ranges, elevations = [], []
+    for packet in scan.packets:
+        data = bytes(packet.data)
+        for block in range(12):
+            assert data[100 * block : 100 * block + 2] == b"\xff\xee"
+            for at in range(32):
+                raw = struct.unpack_from("<H", data, 100 * block + 4 + 3 * at)[0]
+                if raw:
+                    ranges.append(QUANTUM_M * raw)
+                    elevations.append(ELEVATIONS_DEG[at % 16])
+    return np.array(ranges), np.array(elevations)
+
+
+def test_truth_is_in_the_order_of_the_packets(noisy_bag):
+    scans = read(noisy_bag, "/velodyne/front/velodyne_packets")
+    truths = read(noisy_bag, "/points_truth")
+    assert len(scans) == len(truths) == 3
+    for scan, message in zip(scans, truths):
+        truth = cloud_io.to_array(message)
+        ranges, elevations = ranges_of(scan)
+        assert len(ranges) == len(truth) > 15000
+        xyz = np.stack([truth["x"], truth["y"], truth["z"]], axis=1).astype(float)
+        # float32 coordinates up to 100 m
+        np.testing.assert_allclose(np.linalg.norm(xyz, axis=1), ranges, atol=2e-5)
+        sines = np.sin(np.radians(elevations))
+        np.testing.assert_allclose(xyz[:, 2] / ranges, sines, atol=1e-5)
+        assert scan.packets[0].stamp <= message.header.stamp <= scan.packets[0].stamp + _ms(2)
+
+
+def _ms(milliseconds):
+    import rospy
+
+    return rospy.Duration(0, int(milliseconds * 1e6))
+
+
+def test_scans_are_whole_turns_without_gaps(noisy_bag):
+    stamps = [
+        packet.stamp.to_nsec()
+        for scan in read(noisy_bag, "/velodyne/front/velodyne_packets")
+        for packet in scan.packets
+    ]
+    # 24 firings of 55.296 us
+    assert set(np.diff(stamps)) == {24 * 55296}
+    assert abs(len(stamps) - 0.3e9 / (24 * 55296)) < 1
+
+
+def edge_distance(labels):
+    """Distance (px) from each pixel's centre to that of the nearest pixel of another class."""
+    import cv2
+
+    result = np.full(labels.shape, np.inf, np.float32)
+    for kind in np.unique(labels):
+        inside = (labels == kind).astype(np.uint8)
+        if inside.all():
+            continue
+        distance = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        result[inside > 0] = distance[inside > 0]
+    return result
+
+
+def matrix(position, q):
+    x, y, z, w = q.x, q.y, q.z, q.w
+    result = np.eye(4)
+    result[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    result[:3, 3] = [position.x, position.y, position.z]
+    return result
+
+
+def test_visible_points_fall_on_their_class(tmp_path):
+    """Standing world: the measured points, moved by the true poses and seen through the lens, meet
+    pixels of their own class wherever an edge is more than 1.5 px away."""
+    bag = str(tmp_path / "standing.bag")
+    done = simulate(bag, "--duration", "0.2", "--scale", "0.3", "--exact", "--static")
+    assert done.returncode == 0, done.stderr
+    poses = read(bag, "/truth/poses")
+    times = np.array([message.header.stamp.to_nsec() for message in poses])
+    T_world_base = [matrix(m.pose.pose.position, m.pose.pose.orientation) for m in poses]
+    statics = {
+        t.child_frame_id: matrix(t.transform.translation, t.transform.rotation)
+        for message in read(bag, "/tf_static")
+        for t in message.transforms
+    }
+
+    def pose(stamp):
+        """Linear between two readings 10 ms apart: off by less than 0.2 mm."""
+        right = int(np.searchsorted(times, stamp))
+        weight = (stamp - times[right - 1]) / (times[right] - times[right - 1])
+        return (1 - weight) * T_world_base[right - 1] + weight * T_world_base[right]
+
+    checked = wrong = 0
+    truths = [cloud_io.to_array(m) for m in read(bag, "/points_truth")]
+    scans = read(bag, "/velodyne/front/velodyne_packets")
+    for scan, truth in zip(scans, truths):
+        # The pose of each point's packet block; all its rays within 0.111 ms, 1.2 mm of driving.
+        world = np.empty((len(truth), 3))
+        at = 0
+        for packet in scan.packets:
+            data = bytes(packet.data)
+            for block in range(12):
+                raw = [
+                    struct.unpack_from("<H", data, 100 * block + 4 + 3 * i)[0] for i in range(32)
+                ]
+                count = sum(1 for value in raw if value)
+                T = pose(packet.stamp.to_nsec() + 2 * 55296 * block + 55296)
+                T = T @ statics[scan.header.frame_id]
+                part = truth[at : at + count]
+                xyz = np.stack([part["x"], part["y"], part["z"]], axis=1)
+                world[at : at + count] = xyz @ T[:3, :3].T + T[:3, 3]
+                at += count
+        assert at == len(truth)
+        for index, name in enumerate(CAMERAS):
+            info = read(bag, "/gmsl/%s/camera_info" % name)[0]
+            images = read(bag, "/gmsl/%s/labels_truth" % name)
+            middle = scan.packets[len(scan.packets) // 2].stamp.to_nsec()
+            image = min(images, key=lambda m: abs(m.header.stamp.to_nsec() - middle))
+            labels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width)
+            T = np.linalg.inv(pose(image.header.stamp.to_nsec()) @ statics[info.header.frame_id])
+            p = world @ T[:3, :3].T + T[:3, 3]
+            seen = (truth["visible"] >> index & 1).astype(bool)
+            r = np.hypot(p[:, 0], p[:, 1])
+            theta = np.arctan2(r, p[:, 2])
+            t2 = theta * theta
+            bent = theta * (
+                1 + t2 * (info.D[0] + t2 * (info.D[1] + t2 * (info.D[2] + t2 * info.D[3])))
+            )
+            u = info.K[0] * bent * p[:, 0] / r + info.K[2]
+            v = info.K[4] * bent * p[:, 1] / r + info.K[5]
+            column, row = np.floor(u[seen] + 0.5).astype(int), np.floor(v[seen] + 0.5).astype(int)
+            inside = (column >= 0) & (row >= 0) & (column < image.width) & (row < image.height)
+            # Points at the border may fall just outside, by their rounded poses.
+            assert inside.mean() > 0.995
+            column, row = column[inside], row[inside]
+            far = edge_distance(labels)[row, column] > 2.0
+            label = truth["label"][seen][inside]
+            checked += far.sum()
+            wrong += (labels[row, column] != label)[far].sum()
+    assert checked > 20000
+    # What shows through a gap smaller than a pixel has another class than its pixel.
+    assert wrong <= 1e-3 * checked
+
+
+def test_edge_distance_is_that_of_the_label_image(exact_bag):
+    truth = np.concatenate([cloud_io.to_array(m) for m in read(exact_bag, "/points_truth")])
+    each = np.stack([truth["edge_px_" + name] for name in CAMERAS], axis=1)
+    seen = np.stack([truth["visible"] >> i & 1 for i in range(5)], axis=1).astype(bool)
+    assert np.array_equal(each >= 0, seen)
+    least = np.where(seen, each, np.inf).min(axis=1)
+    least[~seen.any(axis=1)] = -1
+    assert np.array_equal(least.astype(np.float32), truth["edge_px"])
+    assert 0.3 < seen.any(axis=1).mean() < 1.0
+
+
+def test_every_class_occurs(noisy_bag):
+    labels = np.concatenate(
+        [cloud_io.to_array(m)["label"] for m in read(noisy_bag, "/points_truth")]
+    )
+    pixels = [
+        np.frombuffer(m.data, np.uint8)
+        for c in CAMERAS
+        for m in read(noisy_bag, "/gmsl/%s/labels_truth" % c)
+    ]
+    assert set(np.unique(np.concatenate(pixels))) == set(range(DECLARED))
+    assert set(range(DECLARED)) - set(np.unique(labels)) == {1}  # the sky returns nothing
+
+
+def test_scores_err_like_a_network_and_a_perfect_one_does_not(noisy_bag, exact_bag):
+    right = total = 0
+    for name in CAMERAS:
+        for image, score in zip(
+            read(noisy_bag, "/gmsl/%s/labels_truth" % name),
+            read(noisy_bag, "/gmsl/%s/scores" % name),
+        ):
+            assert image.header.stamp == score.header.stamp and score.encoding == "32FC12"
+            assert (score.width, score.height) == (240, 151)
+            scores = np.frombuffer(score.data, np.float32).reshape(151, 240, 12)
+            labels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width)
+            rows = ((np.arange(151) + 0.5) * image.height / 151).astype(int)
+            columns = ((np.arange(240) + 0.5) * image.width / 240).astype(int)
+            right += (scores.argmax(axis=2) == labels[rows][:, columns]).sum()
+            total += 151 * 240
+    assert 0.75 < right / total < 0.95
+    for name in CAMERAS:
+        image = read(exact_bag, "/gmsl/%s/labels_truth" % name)[0]
+        score = read(exact_bag, "/gmsl/%s/scores" % name)[0]
+        scores = np.frombuffer(score.data, np.float32).reshape(image.height * image.width, 12)
+        assert np.array_equal(
+            scores.argmax(axis=1).astype(np.uint8), np.frombuffer(image.data, np.uint8)
+        )
+
+
+def test_odometry_drifts_slowly_and_exact_odometry_does_not(noisy_bag, exact_bag):
+    def positions(bag, topic):
+        points = [m.pose.pose.position for m in read(bag, topic)]
+        return np.array([[p.x, p.y, p.z] for p in points])
+
+    true, said = positions(noisy_bag, "/truth/poses"), positions(noisy_bag, "/zio/odometry/rear")
+    error = np.linalg.norm(said - true, axis=1)
+    way = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
+    assert error[0] < 1e-9
+    # Three standard deviations of the scale, and the noise of the readings.
+    assert 1e-4 < error[-1] < 3 * 0.005 * way + 0.05
+    assert np.array_equal(
+        positions(exact_bag, "/truth/poses"), positions(exact_bag, "/zio/odometry/rear")
+    )
+    transforms = [t for m in read(noisy_bag, "/tf") for t in m.transforms]
+    assert len(transforms) == len(said)
+    assert {(t.header.frame_id, t.child_frame_id) for t in transforms} == {("odom", "base_link")}
+    stamps = [t.header.stamp.to_nsec() for t in transforms]
+    assert set(np.diff(stamps)) == {10000000}
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path):
+    bags = []
+    for number, threads in enumerate(("1", "3")):
+        path = tmp_path / ("%d.bag" % number)
+        done = simulate(path, "--duration", "0.2", "--scale", "0.1", "--threads", threads)
+        assert done.returncode == 0, done.stderr
+        bags.append(path.read_bytes())
+    assert bags[0] == bags[1]
+    other = tmp_path / "other.bag"
+    assert simulate(other, "--duration", "0.2", "--scale", "0.1", "--seed", "2").returncode == 0
+    assert other.read_bytes() != bags[0]
+
+
+def test_wrong_command_lines_are_named(tmp_path):
+    for options, words in (
+        (["--speed", "50"], ["--speed", "'50'", "5 to 15"]),
+        (["--duration", "x"], ["--duration", "'x'"]),
+        (["--images", "some"], ["--images", "'some'"]),
+        (["--nonsense"], ["--nonsense"]),
+        (["--seed"], ["--seed", "value"]),
+    ):
+        done = simulate(tmp_path / "no.bag", *options)
+        assert done.returncode == 2
+        for word in words:
+            assert word in done.stderr
+    assert os.listdir(str(tmp_path)) == []
+    kept = tmp_path / "kept.bag"
+    kept.write_text("mine")
+    done = simulate(kept, "--duration", "0.2")
+    assert done.returncode == 1 and "--force" in done.stderr
+    assert kept.read_text() == "mine"

@@ -1,0 +1,228 @@
+#!/usr/bin/python3
+# SPDX-License-Identifier: MIT
+"""Cameras that fail, and messages that are wrong: a clear line, and the chain goes on.
+
+One manager serves all cases, in the order of their names; its process id must not change.
+"""
+import copy
+import os
+import sys
+import unittest
+
+import rospy
+import rostest
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+import live  # noqa: E402
+from bag_factory import Drive, read_cloud  # noqa: E402
+from rosgraph_msgs.msg import Log  # noqa: E402
+from sensor_msgs.msg import PointCloud2  # noqa: E402
+
+SHIFT_NS = 20 * 10**9  # between the stamps of two cases: a jump, so that each starts anew
+
+
+class Trouble(unittest.TestCase):
+    """Messages are published by the test itself, as fast as they are taken, on the wall clock."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.said = live.Said()
+        cls.diagnostics = live.Diagnostics()
+        cls.context = live.folder()
+        cls.folder = cls.context.__enter__()
+        cls.drive = Drive(scans=2, points_per_scan=1600)
+        cls.made = live.Made(cls.folder, cls.drive)
+        cls.messages = cls.made.messages()
+        cls.expected = cls.made.fused()
+        types = {topic: type(message) for _, topic, message in cls.messages}
+        cls.publishers = {
+            topic: rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
+            for topic, kind in types.items()
+        }
+        cls.semantic = live.Received("/points_semantic", PointCloud2)
+        # Patient with a machine that is busy, and still far shorter than the test.
+        overrides = ["%s.timeout=3" % key for key in ("cameras.front", "cameras.left", "odometry")]
+        cls.overrides = " ".join(overrides + ["reference.timeout=3"])
+        cls.launch = live.launched(
+            "fusion.launch", rig=cls.made.rig, bond="false", overrides=cls.overrides
+        )
+        cls.launch.__enter__()
+        live.wait_for_chain(types, rospy.get_name())
+        cls.pid = live.pid_of(live.MANAGER)
+        cls.case = 0
+
+    @classmethod
+    def tearDownClass(cls):
+        cls.launch.__exit__(None, None, None)
+        cls.context.__exit__(None, None, None)
+
+    def tearDown(self):
+        self.assertEqual(live.pid_of(live.MANAGER), self.pid, "the manager has died")
+
+    def shifted(self):
+        """The drive's messages at stamps that no other case has used: (topic, message)."""
+        type(self).case += 1
+        shift = rospy.Duration.from_sec(0)
+        shift.secs = self.case * SHIFT_NS // 10**9
+        result = []
+        for _, topic, original in self.messages:
+            message = copy.deepcopy(original)
+            for stamped in getattr(message, "transforms", [message]):
+                stamped.header.stamp += shift
+            result.append((topic, message))
+        return result
+
+    def publish(self, messages, change=None):
+        """Publishes; `change(topic, message)` gives what goes out instead, None for nothing."""
+        for topic, message in messages:
+            message = message if change is None else change(topic, message)
+            if message is not None:
+                self.publishers[topic].publish(message)
+                rospy.rostime.wallsleep(0.003)  # the pace of a drive; no step waits for it
+
+    def run_drive(self, change=None, scans=2):
+        self.semantic.clear()
+        self.publish(self.shifted(), change)
+        return [read_cloud(m) for m in self.semantic.wait_for(scans)[:scans]]
+
+    def assert_good(self):
+        """An unchanged drive gives what fuse_bag gives."""
+        self.semantic.clear()
+        self.publish(self.shifted())
+        received = self.semantic.wait_for(2)
+        self.assertEqual(len(received), len(self.expected))
+        for message, stamp in zip(received, sorted(self.expected)):
+            ours, theirs = read_cloud(message), read_cloud(self.expected[stamp])
+            self.assertEqual(ours["status"].tobytes(), theirs["status"].tobytes())
+            self.assertEqual(ours["label"].tobytes(), theirs["label"].tobytes())
+
+    def test_00_good(self):
+        self.assert_good()
+
+    def test_01_a_camera_that_stops_affects_only_itself(self):
+        clouds = self.run_drive(lambda topic, m: None if topic == "/left/image" else m)
+        for cloud, stamp in zip(clouds, sorted(self.expected)):
+            whole = read_cloud(self.expected[stamp])
+            self.assertFalse((cloud["cameras"] & 2).any(), "a camera without images contributed")
+            only_front = whole["cameras"] == 1
+            self.assertGreater(only_front.sum(), 100)
+            self.assertTrue((cloud["status"][only_front] == 0).all())
+            only_left = whole["cameras"] == 2
+            self.assertGreater(only_left.sum(), 100)
+            # A point can be hidden in the other camera's image, or leave this one's when the
+            # vehicle's motion to the image is left out; all others wait in vain.
+            self.assertLessEqual(set(cloud["status"][only_left]), {1, 2, 3})
+            self.assertGreater((cloud["status"][only_left] == 3).sum(), 100)
+        live.wait_until(
+            lambda: any(
+                "left" in text and level > 0
+                for level, text in self.diagnostics.summaries.get("image_selection", ())
+            ),
+            lambda: "diagnostics that name the camera: %s" % self.diagnostics.summaries,
+        )
+        self.assert_good()
+
+    def test_02_scores_that_do_not_come_affect_only_their_camera(self):
+        clouds = self.run_drive(lambda topic, m: None if topic == "/front/scores" else m)
+        for cloud in clouds:
+            self.assertEqual(set(cloud["cameras"][cloud["status"] == 0]), {2})
+            self.assertTrue((cloud["status"] == 3).any())
+        live.wait_until(
+            lambda: self.diagnostics.value("projection", "front: timed out"),
+            "a count of the camera",
+        )
+        self.assert_good()
+
+    def test_03_wrong_number_of_channels(self):
+        def change(topic, message):
+            if topic == "/front/scores":
+                message.encoding = "32FC3"
+                message.data = message.data[: 12 * message.width * message.height]
+                message.step = 12 * message.width
+            return message
+
+        for cloud in self.run_drive(change):
+            self.assertEqual(set(cloud["cameras"][cloud["status"] == 0]), {2})
+        self.said.wait_for(r"/front/scores: .*3.*4", Log.ERROR)
+        self.assert_good()
+
+    def test_04_wrong_encoding(self):
+        def change(topic, message):
+            if topic == "/left/image":
+                message.encoding = "klingon16"
+            return message
+
+        for cloud in self.run_drive(change):
+            self.assertEqual(set(cloud["cameras"][cloud["status"] == 0]), {1})
+        self.said.wait_for(r"/left/image_selected: .*klingon16", Log.ERROR)
+        self.assert_good()
+
+    def test_05_image_whose_data_is_cut_off(self):
+        def change(topic, message):
+            if topic == "/left/image":
+                message.data = message.data[: len(message.data) // 2]
+            return message
+
+        for cloud in self.run_drive(change):
+            self.assertEqual(set(cloud["cameras"][cloud["status"] == 0]), {1})
+        self.assert_good()
+
+    def test_06_unknown_camera_model(self):
+        def change(topic, message):
+            if topic == "/left/camera_info":
+                message.distortion_model = "pear_shaped"
+            return message
+
+        for cloud in self.run_drive(change):
+            self.assertEqual(set(cloud["cameras"][cloud["status"] == 0]), {1})
+        self.said.wait_for(r"/left/camera_info: .*pear_shaped", Log.ERROR)
+        self.assert_good()
+
+    def test_07_malformed_cloud(self):
+        first = []
+
+        def change(topic, message):
+            if topic == "/points" and not first:
+                first.append(True)
+                message.point_step = 7
+            return message
+
+        self.assertEqual(len(self.run_drive(change, scans=1)), 1)
+        self.said.wait_for(r"/points: .*", Log.ERROR)
+        self.assert_good()
+
+    def test_08_empty_cloud_gives_an_empty_cloud(self):
+        def change(topic, message):
+            if topic == "/points":
+                message.width, message.row_step, message.data = 0, 0, b""
+            return message
+
+        for cloud in self.run_drive(change):
+            self.assertEqual(len(cloud), 0)
+        self.assert_good()
+
+    def test_09_image_with_stamp_zero(self):
+        def change(topic, message):
+            if topic == "/left/image":
+                message.header.stamp = rospy.Time()
+            return message
+
+        for cloud in self.run_drive(change):
+            self.assertEqual(set(cloud["cameras"][cloud["status"] == 0]), {1})
+        self.said.wait_for(r"/?left/image: header.stamp is 0", Log.ERROR)
+        self.assert_good()
+
+    def test_10_every_nodelet_reports(self):
+        names = ("image_selection", "superpixel_uncertainty", "motion_compensation", "projection")
+        live.wait_until(
+            lambda: all(
+                any("rate (Hz)" in key for key in self.diagnostics.values.get(name, ()))
+                for name in names
+            ),
+            lambda: "diagnostics of %s; came: %s" % (names, sorted(self.diagnostics.values)),
+        )
+
+
+if __name__ == "__main__":
+    rospy.init_node("test_trouble")
+    rostest.rosrun("semantic_lidar_fusion", "trouble", Trouble)
