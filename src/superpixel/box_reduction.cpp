@@ -7,10 +7,7 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-// Below this area of a box (in units) the quotient of two floats, cut to an integer, is exact:
-// numerators stay below 2^24, and a quotient below 256 that is no integer is at least 1 / area from
-// the next one, more than its rounding error of 2^-17.
-constexpr std::int64_t kFloatDivisionArea = 1 << 16;
+constexpr std::int64_t kSmallArea = 1 << 16;
 
 }  // namespace
 
@@ -20,7 +17,7 @@ BoxReduction::Axis::Axis(int source_count, int target_count) {
   source_units = target_count / divisor;
 }
 
-BoxReduction::Span BoxReduction::Axis::span(int target_index) const {
+BoxSpan BoxReduction::Axis::span(int target_index) const {
   const std::int64_t begin = target_index * target_units, end = begin + target_units;
   const std::int64_t first = begin / source_units, last = (end - 1) / source_units;
   const std::int64_t first_end = std::min(end, (first + 1) * source_units);
@@ -36,23 +33,25 @@ BoxReduction::BoxReduction(const ImageSize& source, const ImageSize& target, int
       x_(source.width, target.width),
       y_(source.height, target.height) {
   for (int x = 0; x < target.width; ++x) columns_.push_back(x_.span(x));
-  row_sums_.resize(static_cast<std::size_t>(source.width) * channels);
-  result_.resize(static_cast<std::size_t>(target.width) * channels);
+  // One entry more than there are, as averageColumns wants it.
+  row_sums_.resize(static_cast<std::size_t>(source.width) * channels + 1);
+  result_.resize(static_cast<std::size_t>(target.width) * channels + 1);
 }
 
-template <typename Sum>
-void BoxReduction::sumColumns(std::vector<Sum>* sums) const {
-  sums->resize(result_.size());
-  Sum* out = sums->data();
-  const Sum whole = static_cast<Sum>(x_.source_units);
-  for (const Span& span : columns_) {
+/// For any number of channels and any area.
+void BoxReduction::averageAnyColumns() {
+  const std::int64_t area = x_.target_units * y_.target_units;
+  std::uint8_t* out = result_.data();
+  for (const BoxSpan& span : columns_) {
     const std::uint32_t* in = &row_sums_[static_cast<std::size_t>(span.first) * channels_];
     const int last = (span.count - 1) * channels_;
     for (int c = 0; c < channels_; ++c) {
-      Sum between = 0;
+      std::int64_t between = 0;
       for (int i = channels_ + c; i < last; i += channels_) between += in[i];
-      *out++ = static_cast<Sum>(span.first_weight) * static_cast<Sum>(in[c]) + whole * between +
-               static_cast<Sum>(span.last_weight) * static_cast<Sum>(in[last + c]);
+      const std::int64_t sum = static_cast<std::int64_t>(span.first_weight) * in[c] +
+                               x_.source_units * between +
+                               static_cast<std::int64_t>(span.last_weight) * in[last + c];
+      *out++ = static_cast<std::uint8_t>((sum + area / 2) / area);
     }
   }
 }
@@ -60,29 +59,23 @@ void BoxReduction::sumColumns(std::vector<Sum>* sums) const {
 const std::uint8_t* BoxReduction::row(const cv::Mat& image, int y, const SlicKernels& kernels) {
   if (source_ == target_) return image.ptr(y);
 
-  const Span span = y_.span(y);
+  const BoxSpan span = y_.span(y);
   rows_.clear();
   for (int i = 0; i < span.count; ++i) rows_.push_back(image.ptr(span.first + i));
   row_weights_.assign(span.count, static_cast<std::uint32_t>(y_.source_units));
   row_weights_.front() = span.first_weight;
   if (span.count > 1) row_weights_.back() = span.last_weight;
-  kernels.sumRows(rows_.data(), row_weights_.data(), span.count, static_cast<int>(row_sums_.size()),
+  kernels.sumRows(rows_.data(), row_weights_.data(), span.count, source_.width * channels_,
                   row_sums_.data());
 
   const std::int64_t area = x_.target_units * y_.target_units;
-  if (area < kFloatDivisionArea) {
-    sumColumns(&small_sums_);
-    const auto half = static_cast<std::int32_t>(area / 2);
-    const auto divisor = static_cast<float>(area);
-    for (std::size_t i = 0; i < result_.size(); ++i) {
-      result_[i] = static_cast<std::uint8_t>(
-          static_cast<int>(static_cast<float>(small_sums_[i] + half) / divisor));
-    }
+  if (channels_ == 3 && area < kSmallArea) {
+    kernels.averageColumns(row_sums_.data(),
+                           {columns_.data(), target_.width,
+                            static_cast<std::uint32_t>(x_.source_units), static_cast<int>(area)},
+                           result_.data());
   } else {
-    sumColumns(&sums_);
-    for (std::size_t i = 0; i < result_.size(); ++i) {
-      result_[i] = static_cast<std::uint8_t>((sums_[i] + area / 2) / area);
-    }
+    averageAnyColumns();
   }
   return result_.data();
 }

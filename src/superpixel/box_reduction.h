@@ -25,30 +25,22 @@ class BoxReduction {
   const std::uint8_t* row(const cv::Mat& image, int y, const SlicKernels& kernels);
 
  private:
-  /// Source cells under a target cell: the first and the last count in part, those between whole.
-  struct Span {
-    int first, count;
-    std::uint32_t first_weight, last_weight;  ///< last_weight is 0 if there is one cell only
-  };
   /// One axis, in a unit that divides both cells: a target cell has `target_units`, a source cell
   /// `source_units`, which is also the weight of a whole one.
   struct Axis {
     Axis() = default;
     Axis(int source_count, int target_count);
-    Span span(int target_index) const;
+    BoxSpan span(int target_index) const;
     std::int64_t target_units = 1, source_units = 1;
   };
-  template <typename Sum>
-  void sumColumns(std::vector<Sum>* sums) const;
+  void averageAnyColumns();
 
   ImageSize source_, target_;
   int channels_ = 0;
   Axis x_, y_;
-  std::vector<Span> columns_;  ///< of each target column
+  std::vector<BoxSpan> columns_;  ///< of each target column
   std::vector<const std::uint8_t*> rows_;
   std::vector<std::uint32_t> row_weights_, row_sums_;
-  std::vector<std::int32_t> small_sums_;
-  std::vector<std::int64_t> sums_;
   std::vector<std::uint8_t> result_;
 };
 

@@ -2,6 +2,7 @@
 #include "slic_kernels.h"
 
 #include <algorithm>
+#include <cstddef>
 #include <cstdlib>
 
 namespace semantic_lidar_fusion {
@@ -89,6 +90,26 @@ void sumRows(const std::uint8_t* const* rows, const std::uint32_t* weights, int 
   }
 }
 
+// The quotient of two floats, cut to an integer, is exact here: numerators stay below 2^24, and a
+// quotient below 256 that is no integer is at least 1 / area from the next one, more than its
+// rounding error of 2^-17.
+void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out) {
+  const auto divisor = static_cast<float>(columns.area);
+  for (int i = 0; i < columns.count; ++i) {
+    const BoxSpan& span = columns.spans[i];
+    const std::uint32_t* first = sums + static_cast<std::ptrdiff_t>(span.first) * 3;
+    const std::uint32_t* last = first + static_cast<std::ptrdiff_t>(span.count - 1) * 3;
+    for (int c = 0; c < 3; ++c) {
+      std::uint32_t between = 0;
+      for (const std::uint32_t* in = first + 3; in < last; in += 3) between += in[c];
+      const std::uint32_t sum = span.first_weight * first[c] + columns.whole_weight * between +
+                                span.last_weight * last[c] + columns.area / 2;
+      *out++ = static_cast<std::uint8_t>(
+          static_cast<int>(static_cast<float>(static_cast<int>(sum)) / divisor));
+    }
+  }
+}
+
 void runStarts(const std::uint8_t* index, int block_count, std::uint32_t* starts) {
   for (int block = 0; block < block_count; ++block, index += kBlockWidth) {
     std::uint32_t bits = 0;
@@ -101,8 +122,8 @@ void runStarts(const std::uint8_t* index, int block_count, std::uint32_t* starts
 
 }  // namespace
 
-const SlicKernels kPlainSlicKernels = {"plain", assign,  accumulate, opponentColours,
-                                       smooth,  sumRows, runStarts};
+const SlicKernels kPlainSlicKernels = {"plain", assign,  accumulate,     opponentColours,
+                                       smooth,  sumRows, averageColumns, runStarts};
 
 SlicKernelList usableSlicKernels() {
   SlicKernelList list{1, {&kPlainSlicKernels, nullptr, nullptr}};

@@ -41,6 +41,21 @@ struct SlicSums {
   std::uint32_t colour[3], x, y, pixels;
 };
 
+/// Source cells under a target cell along one axis: the first and the last count in part, those
+/// between with the axis' whole weight.
+struct BoxSpan {
+  int first, count;
+  std::uint32_t first_weight, last_weight;  ///< last_weight is 0 if there is one cell only
+};
+
+/// Boxes of one row, for images of three channels whose boxes have a small area.
+struct BoxColumns {
+  const BoxSpan* spans;  ///< of each target pixel
+  int count;
+  std::uint32_t whole_weight;
+  int area;  ///< sum of the weights of a box, below 2^16
+};
+
 struct SlicKernels {
   const char* name;
 
@@ -65,6 +80,10 @@ struct SlicKernels {
   /// 32 bits.
   void (*sumRows)(const std::uint8_t* const* rows, const std::uint32_t* weights, int row_count,
                   int count, std::uint32_t* sums);
+
+  /// out[3 i + c] = mean over box i of the row sums of channel c, rounded to nearest. One entry
+  /// beyond the end of `sums` is readable and one of `out` writable.
+  void (*averageColumns)(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out);
 
   /// For each block of a row, bit x tells that index[x] differs from index[x - 1]; bit 0 is 0,
   /// since indices of different blocks do not compare.

@@ -265,6 +265,39 @@ void sumRows(const std::uint8_t* const* rows, const std::uint32_t* weights, int 
   }
 }
 
+void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out) {
+  // A pixel's channels in the lower three lanes; what the fourth writes is written again by the
+  // next pixel.
+  const auto at = [sums](std::ptrdiff_t pixel) {
+    return _mm_loadu_si128(reinterpret_cast<const __m128i*>(sums + 3 * pixel));
+  };
+  const auto weighted = [](__m128i value, std::uint32_t weight) {
+    return _mm_mullo_epi32(value, _mm_set1_epi32(static_cast<int>(weight)));
+  };
+  const __m128i half = _mm_set1_epi32(columns.area / 2);
+  const __m128 divisor = _mm_set1_ps(static_cast<float>(columns.area));
+  const __m128i low_bytes =
+      _mm_setr_epi8(0, 4, 8, 12, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1);
+  for (int i = 0; i < columns.count; ++i, out += 3) {
+    const BoxSpan& span = columns.spans[i];
+    __m128i between = _mm_setzero_si128();
+    for (int j = 1; j < span.count - 1; ++j) between = _mm_add_epi32(between, at(span.first + j));
+    __m128i sum = half;
+    if (columns.whole_weight == 1) {
+      // All weights are 1, but for the last one's 0 where there is one cell only.
+      sum = _mm_add_epi32(sum, _mm_add_epi32(between, at(span.first)));
+      if (span.count > 1) sum = _mm_add_epi32(sum, at(span.first + span.count - 1));
+    } else {
+      sum = _mm_add_epi32(sum, weighted(between, columns.whole_weight));
+      sum = _mm_add_epi32(sum, weighted(at(span.first), span.first_weight));
+      sum = _mm_add_epi32(sum, weighted(at(span.first + span.count - 1), span.last_weight));
+    }
+    const __m128i mean = _mm_cvttps_epi32(_mm_div_ps(_mm_cvtepi32_ps(sum), divisor));
+    const int bytes = _mm_cvtsi128_si32(_mm_shuffle_epi8(mean, low_bytes));
+    __builtin_memcpy(out, &bytes, sizeof(bytes));
+  }
+}
+
 void runStarts(const std::uint8_t* index, int block_count, std::uint32_t* starts) {
   for (int block = 0; block < block_count; ++block, index += kBlockWidth) {
     const __m256i here = load(index);
@@ -279,7 +312,7 @@ void runStarts(const std::uint8_t* index, int block_count, std::uint32_t* starts
 
 }  // namespace
 
-const SlicKernels kAvx2SlicKernels = {"avx2", assign,  accumulate, opponentColours,
-                                      smooth, sumRows, runStarts};
+const SlicKernels kAvx2SlicKernels = {"avx2", assign,  accumulate,     opponentColours,
+                                      smooth, sumRows, averageColumns, runStarts};
 
 }  // namespace semantic_lidar_fusion

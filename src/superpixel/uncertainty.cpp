@@ -5,12 +5,11 @@
 #include <cmath>
 #include <string>
 
+#include "score_kernels.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr int kNoVote = -1;
 
 std::string sizeText(int width, int height) {
   return std::to_string(width) + "x" + std::to_string(height);
@@ -50,29 +49,27 @@ struct Histogram {
   std::vector<int> totals;
 };
 
-/// Lets every pixel of the map vote. `label_of(column, row)` is the label of a source cell, or
-/// kNoVote; it is asked once per needed cell of a source row. Returns the votes withheld.
-template <typename LabelOf>
-std::size_t vote(const SuperpixelMap& superpixels, const ImageSize& source, const LabelOf& label_of,
-                 Histogram* histogram) {
+/// Lets every pixel of the map vote. `label_row(row, labels)` writes the labels of a whole source
+/// row, or kNoVote; it is asked once per needed row. Returns the votes withheld.
+template <typename LabelRow>
+std::size_t vote(const SuperpixelMap& superpixels, const ImageSize& source,
+                 const LabelRow& label_row, Histogram* histogram) {
   const cv::Mat& ids = superpixels.ids;
   const std::vector<int> columns = cellsUnderCentres(ids.cols, source.width);
-  const std::vector<int> rows = cellsUnderCentres(ids.rows, source.height);
-  std::vector<int> labels(ids.cols);
+  std::vector<int> labels(source.width);
   std::size_t withheld = 0;
+  int labelled_row = -1;
   for (int y = 0; y < ids.rows; ++y) {
-    if (y == 0 || rows[y] != rows[y - 1]) {
-      for (int x = 0; x < ids.cols; ++x) {
-        labels[x] =
-            x > 0 && columns[x] == columns[x - 1] ? labels[x - 1] : label_of(columns[x], rows[y]);
-      }
-    }
+    const int row = cellUnderCentre(y, ids.rows, source.height);
+    if (row != labelled_row) label_row(row, labels.data());
+    labelled_row = row;
     const int* id = ids.ptr<int>(y);
     for (int x = 0; x < ids.cols; ++x) {
-      if (labels[x] == kNoVote) {
+      const int label = labels[columns[x]];
+      if (label == kNoVote) {
         ++withheld;
       } else {
-        histogram->add(id[x], labels[x]);
+        histogram->add(id[x], label);
       }
     }
   }
@@ -137,16 +134,22 @@ bool ScoreMap::read(int column, int row, float* out) const {
 ShareMap computeShare(const SuperpixelMap& superpixels, const ScoreMap& scores) {
   if (scores.empty()) throw DataError("score map is empty, must have at least one cell");
   const int class_count = scores.classCount();
-  std::vector<float> cell(class_count);
-  const auto label_of = [&](int column, int row) {
-    if (!scores.read(column, row, cell.data())) return kNoVote;
-    // max_element returns the first of equal scores: the lowest id.
-    return static_cast<int>(std::max_element(cell.begin(), cell.end()) - cell.begin());
+  std::vector<float> converted(static_cast<std::size_t>(scores.size().width) * class_count);
+  const LabelCells label_cells = labelCells();
+  const auto label_row = [&](int row, int* labels) {
+    const float* cells = scores.floatRow(row);
+    if (cells == nullptr) {
+      for (int x = 0; x < scores.size().width; ++x) {
+        scores.read(x, row, &converted[static_cast<std::size_t>(x) * class_count]);
+      }
+      cells = converted.data();
+    }
+    label_cells(cells, scores.size().width, class_count, labels);
   };
 
   ShareMap result;
   Histogram histogram(superpixels.count, class_count);
-  result.nonfinite_cells = vote(superpixels, scores.size(), label_of, &histogram);
+  result.nonfinite_cells = vote(superpixels, scores.size(), label_row, &histogram);
 
   result.superpixel.resize(superpixels.count);
   for (int k = 0; k < superpixels.count; ++k) {
@@ -226,12 +229,12 @@ cv::Mat histogramProbabilities(const SuperpixelMap& superpixels, const cv::Mat& 
     throw DataError("label image is " + sizeText(labels.cols, labels.rows) + " of OpenCV type " +
                     std::to_string(labels.type()) + ", must be non-empty 8UC1 (mono8)");
   }
-  const auto label_of = [&](int column, int row) {
-    const int label = labels.ptr<std::uint8_t>(row)[column];
-    return label < class_count ? label : kNoVote;
+  const auto label_row = [&](int row, int* row_labels) {
+    const std::uint8_t* in = labels.ptr<std::uint8_t>(row);
+    for (int x = 0; x < labels.cols; ++x) row_labels[x] = in[x] < class_count ? in[x] : kNoVote;
   };
   Histogram histogram(superpixels.count, class_count);
-  vote(superpixels, {labels.cols, labels.rows}, label_of, &histogram);
+  vote(superpixels, {labels.cols, labels.rows}, label_row, &histogram);
 
   std::vector<float> probabilities(histogram.votes.size());
   for (int k = 0; k < superpixels.count; ++k) {

@@ -41,6 +41,10 @@ class ScoreMap {
   int classCount() const { return scores_.channels(); }
   /// Writes the scores of one cell to `out[0..classCount)`; false if one is not finite.
   bool read(int column, int row, float* out) const;
+  /// The scores of a row's cells one after the other; null where they need a conversion.
+  const float* floatRow(int row) const {
+    return scores_.depth() == CV_32F ? scores_.ptr<float>(row) : nullptr;
+  }
 
  private:
   cv::Mat scores_;

@@ -4,12 +4,18 @@
 #include <algorithm>
 #include <cmath>
 #include <string>
+#include <vector>
 
 #include "map_properties.h"
 #include "superpixel/box_reduction.h"
 
 namespace semantic_lidar_fusion {
 namespace {
+
+std::vector<const SlicKernels*> usableKernels() {
+  const SlicKernelList list = usableSlicKernels();
+  return {list.kernels, list.kernels + list.count};
+}
 
 /// Length that [a, a + 1) * source / target and the source cell j have in common, times target.
 std::int64_t overlap(std::int64_t a, std::int64_t source, std::int64_t target, std::int64_t j) {
@@ -41,8 +47,7 @@ TEST(BoxReduction, IsTheRoundedMeanOfEachBox) {
            {ImageSize{1, 1}, {2, 3}, {16, 12}, {24, 36}, {47, 35}, {130, 96}, {150, 20}}) {
         SCOPED_TRACE(std::to_string(source.width) + "x" + std::to_string(source.height) + " to " +
                      std::to_string(target.width) + "x" + std::to_string(target.height));
-        for (const SlicKernels* kernels :
-             {&kPlainSlicKernels, usableSlicKernels().kernels[usableSlicKernels().count - 1]}) {
+        for (const SlicKernels* kernels : usableKernels()) {
           BoxReduction reduction(source, target, image.channels());
           for (int y = 0; y < target.height; ++y) {
             const std::uint8_t* row = reduction.row(image, y, *kernels);
@@ -59,17 +64,29 @@ TEST(BoxReduction, IsTheRoundedMeanOfEachBox) {
   }
 }
 
-// Every numerator that the float division may meet, at the areas where rounding is tightest.
+// Areas of boxes where rounding is tightest, and the ones around the limit of the fast division.
 TEST(BoxReduction, MeansOfTwoLevelsRoundExactly) {
-  for (const int width : {255, 256, 4095, 65521, 65535, 65536, 70001}) {
-    cv::Mat image(1, width, CV_8UC1, cv::Scalar(254));
-    BoxReduction reduction({width, 1}, {1, 1}, 1);
-    for (int bright = 0; bright <= width; ++bright) {
-      if (bright > 0) image.ptr(0)[bright - 1] = 255;
-      if (bright > 600 && std::abs(2 * bright - width) > 600 && bright + 600 < width) continue;
-      const int expected = 2 * bright >= width ? 255 : 254;
-      ASSERT_EQ(reduction.row(image, 0, kPlainSlicKernels)[0], expected)
-          << bright << " of " << width;
+  for (const int type : {CV_8UC1, CV_8UC3}) {
+    const int channels = CV_MAT_CN(type);
+    for (const int width : {255, 256, 4095, 65521, 65535, 65536, 70001}) {
+      cv::Mat image(1, width, type);
+      BoxReduction reduction({width, 1}, {1, 1}, channels);
+      for (const SlicKernels* kernels : usableKernels()) {
+        image.setTo(cv::Scalar::all(254));
+        for (int bright = 0; bright <= width; ++bright) {
+          if (bright > 0) {
+            for (int c = 0; c < channels; ++c) image.ptr(0)[(bright - 1) * channels + c] = 255;
+          }
+          // Where the mean is near 254, 254.5 and 255.
+          const bool telling = bright < 5 || std::abs(2 * bright - width) < 9 || bright + 5 > width;
+          if (!telling) continue;
+          const std::uint8_t* row = reduction.row(image, 0, *kernels);
+          for (int c = 0; c < channels; ++c) {
+            ASSERT_EQ(row[c], 2 * bright >= width ? 255 : 254)
+                << kernels->name << ": " << bright << " of " << width;
+          }
+        }
+      }
     }
   }
 }

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <limits>
@@ -12,6 +13,7 @@
 #include "map_properties.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
+#include "superpixel/score_kernels.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -253,6 +255,30 @@ TEST(Share, EqualsTheDefinitionForScoreMapsOfAnySize) {
           }
         }
       }
+    }
+  }
+}
+
+TEST(LabelCells, AreTheFirstHighestOfFiniteScores) {
+  std::mt19937 random(21);
+  const float specials[] = {kNan, kInfinity, -kInfinity, -0.0F, 3e38F, -3e38F};
+  for (int class_count = 1; class_count <= 40; ++class_count) {
+    const int cell_count = 300;
+    std::vector<float> scores(static_cast<std::size_t>(cell_count) * class_count);
+    // Few levels, so that ties occur in every lane.
+    for (float& score : scores) score = static_cast<float>(static_cast<int>(random() % 5) - 3);
+    for (int i = 0; i < 60; ++i) scores[random() % scores.size()] = specials[random() % 6];
+    std::vector<int> plain(cell_count), fastest(cell_count);
+    labelCellsPlain(scores.data(), cell_count, class_count, plain.data());
+    labelCells()(scores.data(), cell_count, class_count, fastest.data());
+    for (int i = 0; i < cell_count; ++i) {
+      const float* cell = &scores[static_cast<std::size_t>(i) * class_count];
+      int expected = static_cast<int>(std::max_element(cell, cell + class_count) - cell);
+      for (int c = 0; c < class_count; ++c) {
+        if (!std::isfinite(cell[c])) expected = kNoVote;
+      }
+      ASSERT_EQ(plain[i], expected) << "cell " << i << ", classes " << class_count;
+      ASSERT_EQ(fastest[i], expected) << "cell " << i << ", classes " << class_count;
     }
   }
 }
