@@ -67,7 +67,7 @@ output=$(cd "$output" && pwd)
 
 if [ "$install" = 1 ]; then
   step "dependencies"
-  bash "$source_dir/scripts/install_dependencies.sh" || fail "the dependencies are not installed"
+  bash "$source_dir/scripts/install_dependencies.sh" --no-testing || fail "the dependencies are not installed"
 fi
 
 step "build (log: $output/build.log)"

@@ -3,14 +3,20 @@
 # Installs the Debian or Ubuntu packages that building, testing and the demonstration need.
 # Uses sudo when not root, and only when something is missing; does nothing twice.
 #
-#   scripts/install_dependencies.sh [--help]
+#   scripts/install_dependencies.sh [options]
+#     --no-testing       leave out what only tests and benchmarks use
+#     --help             this text
 set -euo pipefail
 PATH=/usr/sbin:/usr/bin:/sbin:/bin
 
-if [ "${1:-}" = --help ]; then
-  sed -n '3,6s/^# \{0,1\}//p' "$0"
-  exit 0
-fi
+testing=1
+for option in "$@"; do
+  case $option in
+    --no-testing) testing=0 ;;
+    --help | -h) sed -n '3,8s/^# \{0,1\}//p' "$0"; exit 0 ;;
+    *) echo "install_dependencies: unknown option '$option'; try --help" >&2; exit 2 ;;
+  esac
+done
 
 # name on Debian (ROS in the distribution itself)
 debian_ros="catkin libroscpp-dev libnodelet-dev libnodeletlib-dev libnodeletlib-tools pluginlib-dev
@@ -33,8 +39,18 @@ noetic_ros="ros-noetic-catkin ros-noetic-roscpp ros-noetic-nodelet ros-noetic-pl
 common="build-essential cmake libeigen3-dev libopencv-dev libyaml-cpp-dev libgtest-dev
   python3-matplotlib python3-numpy python3-opencv python3-pytest python3-scipy python3-setuptools
   python3-tqdm python3-yaml"
-# Each of these only adds something: the simulator, a peer in a test, the format checks.
-optional="libembree-dev libopencv-contrib-dev clang-format black"
+# Each of these only adds something: the simulator, the map's bindings, export and clusters, ...
+optional="libembree-dev liboctomap-dev pybind11-dev python3-dev python3-dask python3-distributed"
+# ... oracles and peers in tests and benchmarks, the format checks, the fuzzers.
+if [ "$testing" = 1 ]; then
+  optional="$optional libopencv-contrib-dev clang-format black libbenchmark-dev pcl-tools
+    octomap-tools clang libclang-rt-14-dev"
+  if [ -d /opt/ros/noetic ]; then
+    optional="$optional ros-noetic-pcl-ros"
+  else
+    optional="$optional libpcl-ros-dev"
+  fi
+fi
 
 installed() { [ "$(dpkg-query -W -f='${db:Status-Status}' "$1" 2>/dev/null)" = installed ]; }
 offered() { apt-cache show "$1" >/dev/null 2>&1; }
