@@ -165,11 +165,11 @@ void FusionNodelet::error(const std::string& key, const std::string& text) {
 
 void FusionNodelet::watch() {
   diagnostics_->force_update();
+  const bool is_halted = ros::Time::isSimTime() && simulatedClock().second > kClockStall;
   const auto now = Health::Clock::now();
   if (now - started_ < kSilence || now - watched_ < kSilence) return;
   watched_ = now;
   const bool is_silent = !health_.publishedWithin(kSilence);
-  const bool is_halted = ros::Time::isSimTime() && simulatedClock().second > kClockStall;
   if (is_silent && ros::Time::isSimTime() && ros::Time::now().isZero()) {
     warn("clock", "use_sim_time is true but /clock is silent; play with --clock");
     return;
