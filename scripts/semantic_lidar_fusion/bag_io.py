@@ -84,6 +84,10 @@ def message_class(type_name: str) -> Any:
     return _generated[type_name]
 
 
+def _absolute(topic: str) -> str:
+    return topic if topic.startswith("/") else "/" + topic
+
+
 class BagMessage(NamedTuple):
     """One message of a bag, with its record time (ns)."""
 
@@ -95,7 +99,8 @@ class BagMessage(NamedTuple):
 class BagReader:
     """A bag open for reading, as a context manager.
 
-    topics: topic -> message type, for every topic of the bag.
+    topics: topic -> message type, for every topic of the bag. Names begin with a slash, which
+    `rosbag record` leaves away where its command line does.
     """
 
     def __init__(self, path: str):
@@ -115,8 +120,14 @@ class BagReader:
         except (rosbag.ROSBagException, struct.error, ValueError, KeyError) as error:
             raise DataError("%s: not a readable bag (%s)" % (path, error)) from error
         information = self._bag.get_type_and_topic_info()[1]
-        self.topics: Dict[str, str] = {name: entry[0] for name, entry in information.items()}
-        self._counts = {name: int(entry[1]) for name, entry in information.items()}
+        self.topics: Dict[str, str] = {}
+        self._counts: Dict[str, int] = {}
+        self._recorded_names: Dict[str, List[str]] = {}
+        for name, entry in information.items():
+            topic = _absolute(name)
+            self.topics[topic] = entry[0]
+            self._counts[topic] = self._counts.get(topic, 0) + int(entry[1])
+            self._recorded_names.setdefault(topic, []).append(name)
 
     def __enter__(self) -> "BagReader":
         return self
@@ -171,7 +182,7 @@ class BagReader:
         import rosbag
 
         entries: Iterable[Any] = self._bag.read_messages(
-            topics=names,
+            topics=[recorded for name in names for recorded in self._recorded_names[name]],
             start_time=None if start_ns is None else to_stamp(start_ns),
             end_time=None if end_ns is None else to_stamp(end_ns),
         )
@@ -179,7 +190,7 @@ class BagReader:
             entries = cli.progress(entries, self.count(names), label)
         try:
             for topic, message, stamp in entries:
-                yield BagMessage(topic, message, to_ns(stamp))
+                yield BagMessage(_absolute(topic), message, to_ns(stamp))
         except (rosbag.ROSBagException, struct.error, OSError, EOFError) as error:
             raise DataError("%s: damaged (%s)" % (self.path, error)) from error
 

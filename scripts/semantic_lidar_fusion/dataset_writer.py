@@ -87,6 +87,17 @@ def _write_temporary(file: bag_io.AtomicFile, text: str) -> None:
         ) from error
 
 
+def _wait_s(drive: records.Drive) -> float:
+    """How long a scan may have to wait live, s: it comes to the bag at its start, and what it waits
+    for may be as rare as the slowest of the others, with as much again for a machine that is busy.
+    """
+    tracks = [[image.stamp_ns for image in camera.images] for camera in drive.cameras]
+    if drive.odometry is not None:
+        tracks.append([int(stamp) for stamp in drive.odometry[0]])
+    periods = [float(np.median(np.diff(track))) * 1e-9 for track in tracks if len(track) > 1]
+    return round(min(1.0, 0.1 + 2 * max(periods, default=0.0)), 2)
+
+
 def rig_tree(drive: records.Drive, rig_path: str, options: Options) -> Dict[str, Any]:
     """The rig file's contents; keys that have their default are left out."""
     cameras = []
@@ -106,8 +117,12 @@ def rig_tree(drive: records.Drive, rig_path: str, options: Options) -> Dict[str,
         "fixed_frame": FIXED_FRAME,
         "vehicle_frame": VEHICLE_FRAME,
         "motion": {"enabled": drive.motion_enabled},
-        "odometry": {"source": "tf"},
-        "reference": {"choose": "closest_image", "camera": drive.cameras[0].name},
+        "odometry": {"source": "tf", "timeout": _wait_s(drive)},
+        "reference": {
+            "choose": "closest_image",
+            "camera": drive.cameras[0].name,
+            "timeout": _wait_s(drive),
+        },
     }
     if options.model:
         folder = os.path.dirname(os.path.abspath(rig_path))
