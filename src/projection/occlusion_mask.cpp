@@ -3,15 +3,12 @@
 
 #include <algorithm>
 #include <cmath>
-#include <numeric>
 
 #include "paper_mask.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/projection/surface_mask.h"
 
 namespace semantic_lidar_fusion {
-
-namespace {}  // namespace
 
 MaskSize paperMaskSize(const CameraModel& camera, double horizontal_step_rad,
                        double vertical_step_rad) {
