@@ -387,7 +387,9 @@ def mask_visibility(unmasked: FusedBag, masked: FusedBag, truth: Truth) -> Optio
             raise DataError(
                 "%s and %s: not the same scans, or no field cameras" % (unmasked.path, masked.path)
             )
-        result.add(cameras[0], cameras[1], visible, scan.flags("catchable"))
+        result.add(
+            cameras[0], cameras[1], visible, scan.flags("catchable"), scan.flags("silhouette")
+        )
     return result
 
 
