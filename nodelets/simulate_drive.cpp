@@ -26,7 +26,11 @@ the truth beside it. config/demo.yaml is its rig. The same options give the same
 
   /points_truth            x y z as measured, label, visible (bit i: the i-th camera sees the
                            point), surface (object), edge_px (distance to the nearest class edge,
-                           the least of all cameras that see it; -1: none), edge_px_<camera>;
+                           the least of all cameras that see it; -1: none), edge_px_<camera>,
+                           catchable (bit i: hidden from camera i by something that the lidar has
+                           measured within one ring and one azimuth step of the line of sight),
+                           silhouette (bit i: camera i sees the point, as near to something before
+                           it);
                            the decoder's points in their order, stamped with the first one's time
   /gmsl/*/labels_truth     class ids of the images that scans use
   /truth/poses             where the vehicle really is

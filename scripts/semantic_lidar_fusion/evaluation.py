@@ -422,7 +422,9 @@ def mask_visibility(
             raise DataError(
                 "%s and %s: not the same scans, or no field cameras" % (unmasked.path, masked.path)
             )
-        result.add(cameras[0], cameras[1], visible, scan.flags("catchable"))
+        result.add(
+            cameras[0], cameras[1], visible, scan.flags("catchable"), scan.flags("silhouette")
+        )
     return result
 
 
