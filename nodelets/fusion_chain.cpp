@@ -97,8 +97,9 @@ void FusionChain::segment(std::size_t index, SegmentedImage* image) {
   }
   camera.semantics.noteScores(image->input);
   const ImageSize pixels{image->image.cols, image->image.rows};
-  const SuperpixelMap superpixels = camera.semantics.cluster(
-      image->image, camera.semantics.mapSize(pixels).value_or(pixels), image->stamp);
+  const ImageSize map_size = camera.semantics.mapSize(pixels).value_or(pixels);
+  image->note = camera.semantics.clampNote(map_size);
+  const SuperpixelMap superpixels = camera.semantics.cluster(image->image, map_size, image->stamp);
   image->superpixel_ids = superpixels.ids;
   if (camera.config.input == CameraInput::kLabels) {
     image->semantics.probabilities =

@@ -33,6 +33,7 @@ struct SegmentedImage {
   cv::Mat share;                      ///< scores only
   ImageSemantics semantics;           ///< what the projection reads
   bool from_network = false;          ///< `input` was made by the package's own network
+  std::string note;                   ///< what to tell a user of its superpixels; mostly empty
 };
 
 /// Where one camera stands in one scan.
