@@ -4,6 +4,7 @@
 Every wait is for a condition and bounded; nothing here sleeps for a fixed time to be in step.
 """
 import contextlib
+import copy
 import hashlib
 import os
 import re
@@ -46,6 +47,15 @@ class SetBool:
     _md5sum = "09fb03525b03e7ea1fd3992bafd87e16"
     _request_class = _dynamic("std_srvs/SetBoolRequest", "bool data\n")
     _response_class = _dynamic("std_srvs/SetBoolResponse", "bool success\nstring message\n")
+
+
+# bond/Status, whose Python package need not be installed.
+BOND_STATUS = _dynamic(
+    "bond/Status",
+    "Header header\nstring id\nstring instance_id\nbool active\nfloat32 heartbeat_timeout\n"
+    "float32 heartbeat_period\n" + "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\n"
+    "string frame_id\n",
+)
 
 
 def wait_until(condition, what, timeout=30.0):
@@ -248,6 +258,48 @@ def difference(a, b):
         if count:
             parts.append("%s of %d points" % (name, count))
     return "data differs: " + (", ".join(parts) or "padding")
+
+
+class Feed:
+    """Publishes a drive again and again on the wall clock, at stamps that no other pass has used:
+    each pass is a jump of time, so that each starts anew."""
+
+    SHIFT_S = 20
+
+    def __init__(self, made):
+        self._messages = made.messages()
+        types = {topic: type(message) for _, topic, message in self._messages}
+        self.topics = set(types)
+        self.publishers = {
+            topic: rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
+            for topic, kind in types.items()
+        }
+        self._passes = 0
+
+    def next_drive(self):
+        """The drive's messages at the stamps of the next pass: (topic, message)."""
+        self._passes += 1
+        result = []
+        for _, topic, original in self._messages:
+            message = copy.deepcopy(original)
+            for stamped in getattr(message, "transforms", [message]):
+                stamped.header.stamp.secs += self._passes * self.SHIFT_S
+            for packet in getattr(message, "packets", []):
+                packet.stamp.secs += self._passes * self.SHIFT_S
+            result.append((topic, message))
+        return result
+
+    def publish(self, messages, change=None):
+        """Publishes; `change(topic, message)` gives what goes out instead, None for nothing."""
+        for topic, message in messages:
+            message = message if change is None else change(topic, message)
+            if message is not None:
+                self.publishers[topic].publish(message)
+                rospy.rostime.wallsleep(0.003)  # the pace of a drive; no step waits for it
+
+    def close(self):
+        for publisher in self.publishers.values():
+            publisher.unregister()
 
 
 class Network:
