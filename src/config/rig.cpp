@@ -257,7 +257,7 @@ SuperpixelConfig readSuperpixels(const YAML::Node& node, Problems* problems) {
   YamlSection section(node, "superpixels", problems);
   section.integer("count", &superpixels.count, 1, 10000000);
   section.number("compactness", &superpixels.compactness, {0, 1e6, true});
-  section.integer("iterations", &superpixels.iterations, 1, 1000);
+  section.integer("iterations", &superpixels.iterations, 1, 100);
   section.number("scale", &superpixels.scale, {0, 4});
   section.boolean("warm_start", &superpixels.warm_start);
   section.finish();
