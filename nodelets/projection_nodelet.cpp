@@ -301,6 +301,7 @@ class ProjectionNodelet : public FusionNodelet {
       health().problem(name + ": semantics left the buffer");
       return std::nullopt;
     }
+    health().count(name + ": images used");
     SegmentedImage image;
     image.stamp = state.image_stamp;
     if (known->probabilities) {

@@ -198,5 +198,6 @@ int main(int argc, char** argv) {
   action.sa_handler = semantic_lidar_fusion::simulator::rememberSignal;
   ::sigaction(SIGINT, &action, nullptr);
   ::sigaction(SIGTERM, &action, nullptr);
+  ::signal(SIGXFSZ, SIG_IGN);  // a file size limit is then an error of the write
   return semantic_lidar_fusion::simulator::run(std::vector<std::string>(argv + 1, argv + argc));
 }
