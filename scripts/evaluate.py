@@ -88,6 +88,21 @@ def make_parser():
         default=2,
         help="score every N-th pixel in both directions (default: 2)",
     )
+    parser.add_argument(
+        "--map",
+        action="store_true",
+        help="also score voxel maps of the clouds (see build_semantic_map.py), with the tf of IN.bag",
+    )
+    parser.add_argument(
+        "--voxel",
+        metavar="M",
+        type=float,
+        default=0.2,
+        help="edge of the map's voxels (default: 0.2)",
+    )
+    parser.add_argument(
+        "--frame", metavar="NAME", help="frame of the map (default: map or odom, as tf has it)"
+    )
     parser.add_argument("--fuse-bag", metavar="FILE", help="the program (default: looked for)")
     parser.add_argument("--keep-bags", action="store_true", help="keep the fused bags in --out")
     parser.add_argument("--force", action="store_true", help="replace earlier results in --out")
@@ -116,7 +131,7 @@ def check(parser, options):
         for name in ("model", "classes"):
             if not getattr(options, name):
                 parser.error("--images needs --" + name)
-        for name in ("rig", "truth", "clouds", "fit_on"):
+        for name in ("rig", "truth", "clouds", "fit_on", "map"):
             if getattr(options, name):
                 parser.error("--images and --%s exclude each other" % name.replace("_", "-"))
     elif not options.rig and not options.clouds:

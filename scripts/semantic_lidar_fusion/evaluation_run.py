@@ -121,6 +121,8 @@ def _evaluate_drive(options: Any, results: Results, workspace: str) -> str:
     if tables.unmasked_of(scores) is not None:
         rates = evaluation.mask_visibility(fused[-2], fused[-1], truth)
     results.add_scores(scores, rates)
+    if options.map:
+        _add_maps(results, options, [name for name, _ in bags], fused, truth, labels)
     if options.fit_temperature:
         assert rig is not None
         fit_bag = options.fit_on or options.bag
@@ -129,6 +131,34 @@ def _evaluate_drive(options: Any, results: Results, workspace: str) -> str:
             results, program, rig, (fit_bag, fit_truth), (options.bag, truth), common, workspace
         )
     return "Evaluation of %s" % os.path.basename(options.bag)
+
+
+def _add_maps(
+    results: Results,
+    options: Any,
+    names: Sequence[str],
+    fused: Sequence[FusedBag],
+    truth: Truth,
+    labels: LabelSet,
+) -> None:
+    from semantic_lidar_fusion import map_evaluation
+    from semantic_lidar_fusion.semantic_map import MapConfig
+    from semantic_lidar_fusion.semantic_map_build import (
+        Drive,
+        choose_frame,
+        first_cloud,
+        transforms_of,
+    )
+
+    drive = Drive(fused[-1].path, (options.bag,))
+    frame_id = choose_frame(drive, first_cloud(drive), options.frame)
+    config = MapConfig(voxel_size_m=options.voxel).checked(len(labels))
+    compared = map_evaluation.evaluate_maps(
+        names, fused, truth, labels, transforms_of(drive), frame_id, config
+    )
+    section, files = map_evaluation.tables(compared)
+    results.sections.append(section)
+    results.files.update(files)
 
 
 def _compare(
