@@ -107,6 +107,21 @@ def make_parser():
         help="instead of Table I: what the occlusion masks catch and lose on each drive (adaptive, and "
         "the paper's at its 0.1 deg and at a VLP-16's 0.2 deg)",
     )
+    parser.add_argument(
+        "--map",
+        action="store_true",
+        help="also score voxel maps of the clouds (see build_semantic_map.py), with the tf of IN.bag",
+    )
+    parser.add_argument(
+        "--voxel",
+        metavar="M",
+        type=float,
+        default=0.2,
+        help="edge of the map's voxels (default: 0.2)",
+    )
+    parser.add_argument(
+        "--frame", metavar="NAME", help="frame of the map (default: map or odom, as tf has it)"
+    )
     parser.add_argument("--fuse-bag", metavar="FILE", help="the program (default: looked for)")
     parser.add_argument("--keep-bags", action="store_true", help="keep the fused bags in --out")
     parser.add_argument("--force", action="store_true", help="replace earlier results in --out")
@@ -135,14 +150,14 @@ def check(parser, options):
         for name in ("model", "classes"):
             if not getattr(options, name):
                 parser.error("--images needs --" + name)
-        for name in ("rig", "truth", "clouds", "fit_on", "live", "masks"):
+        for name in ("rig", "truth", "clouds", "fit_on", "live", "masks", "map"):
             if getattr(options, name):
                 parser.error("--images and --%s exclude each other" % name.replace("_", "-"))
     elif not options.rig and not options.clouds:
         parser.error("give --rig, or --clouds of existing bags")
     if options.masks and not options.rig:
         parser.error("--masks needs --rig")
-    for name in ("truth", "clouds", "live", "fit_temperature"):
+    for name in ("truth", "clouds", "live", "fit_temperature", "map"):
         if getattr(options, name) and len(options.bags) > 1:
             parser.error("--%s is for one IN.bag" % name.replace("_", "-"))
         if getattr(options, name) and options.masks and name != "truth":

@@ -150,6 +150,8 @@ def _evaluate_drive(options: Any, results: Results, workspace: str) -> str:
         results.add_drives(drives)
     if options.live:
         results.add_live(evaluation.compare_clouds(fused[-2], fused[-1]), runs[-2][0])
+    if options.map:
+        _add_maps(results, options, [name for name, _ in runs], fused, truth, labels)
     if options.fit_temperature:
         assert rig is not None
         fit_bag = options.fit_on or bag
@@ -211,6 +213,34 @@ def _compare_masks(options: Any, rig: Rig, workspace: str) -> List[Tuple[str, st
                 raise DataError("%s: its points_truth has no field visible" % bag)
             result.append((drive, mask.name, rates))
     return result
+
+
+def _add_maps(
+    results: Results,
+    options: Any,
+    names: Sequence[str],
+    fused: Sequence[FusedBag],
+    truth: Truth,
+    labels: LabelSet,
+) -> None:
+    from semantic_lidar_fusion import map_evaluation
+    from semantic_lidar_fusion.semantic_map import MapConfig
+    from semantic_lidar_fusion.semantic_map_build import (
+        Drive,
+        choose_frame,
+        first_cloud,
+        transforms_of,
+    )
+
+    drive = Drive(fused[-1].path, tuple(options.bags))
+    frame_id = choose_frame(drive, first_cloud(drive), options.frame)
+    config = MapConfig(voxel_size_m=options.voxel).checked(len(labels))
+    compared = map_evaluation.evaluate_maps(
+        names, fused, truth, labels, transforms_of(drive), frame_id, config
+    )
+    section, files = map_evaluation.tables(compared)
+    results.sections.append(section)
+    results.files.update(files)
 
 
 def _compare(

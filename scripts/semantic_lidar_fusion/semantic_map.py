@@ -49,10 +49,10 @@ class MapConfig:
 
     voxel_size_m: float = 0.2
     kind: str = "log"
-    weight: float = 0.1
-    floor: float = 0.01
+    weight: float = 0.7
+    floor: float = 1e-3
     prior: Optional[Tuple[float, ...]] = None
-    clamp: float = 10.0
+    clamp: float = 5.0
     min_range_m: float = 0.0
     max_range_m: float = 0.0
     dynamic: str = "apart"

@@ -45,6 +45,11 @@ class OutputFolder:
     def _failed(self, error: OSError) -> DataError:
         return DataError("%s: cannot be written (%s)" % (self.path, error.strerror or error))
 
+    def discard(self) -> None:
+        """Removes what is left of the partial folder: an interruption may come between making it
+        and entering the block."""
+        shutil.rmtree(self.partial, ignore_errors=True)
+
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         old = self.partial + ".old"
         try:
@@ -60,8 +65,8 @@ class OutputFolder:
         except OSError as rename_error:
             raise self._failed(rename_error) from rename_error
         finally:
-            shutil.rmtree(self.partial, ignore_errors=True)
             shutil.rmtree(old, ignore_errors=True)
+            self.discard()
         if kind is not None and issubclass(kind, OSError):
             raise self._failed(error) from error
 

@@ -366,6 +366,21 @@ def _write_png(path: str, image: np.ndarray) -> None:
         raise DataError("%s: cannot be written" % path)
 
 
+_EMPTY_RGB = (214, 222, 232)
+_UNNAMED_RGB = (165, 172, 180)
+
+
+def _core(known: np.ndarray) -> Tuple[slice, slice]:
+    """Rows and columns of a grid that hold nearly all of its known cells: single far points would
+    make the picture small."""
+    result = []
+    for axis in (1, 0):
+        share = np.cumsum(known.sum(axis=axis)) / max(int(known.sum()), 1)
+        first, last = np.searchsorted(share, [0.003, 0.997])
+        result.append(slice(max(0, int(first) - 5), int(last) + 6))
+    return result[0], result[1]
+
+
 def draw_picture(path: str, rasters: Rasters, labels: LabelSet, title: str) -> None:
     """The map from above in class colours, paler where it is less sure, with a legend."""
     from matplotlib.patches import Patch
@@ -374,29 +389,33 @@ def draw_picture(path: str, rasters: Rasters, labels: LabelSet, title: str) -> N
 
     pyplot = plotting.pyplot()
     frame = rasters.frame
-    image = np.full(rasters.label.shape + (3,), 255, dtype=np.uint8)
-    named = rasters.label != NO_LABEL
-    color = labels.colors_rgb[np.minimum(rasters.label, len(labels) - 1)].astype(np.float64)
-    strength = 0.25 + 0.75 * rasters.confidence[..., None]
-    image[named] = (color * strength + 235 * (1 - strength))[named].astype(np.uint8)
-    image[~named & ~np.isnan(rasters.elevation_m)] = (215, 215, 215)
-    west, south = frame.origin
-    east, north = west + frame.width * frame.cell_m, south + frame.height * frame.cell_m
-    ratio = frame.height / frame.width
+    rows, columns = _core(~np.isnan(rasters.elevation_m))
+    label = rasters.label[rows, columns]
+    # Neither white nor grey: classes may have these colours.
+    image = np.full(label.shape + (3,), _EMPTY_RGB, dtype=np.uint8)
+    named = label != NO_LABEL
+    color = labels.colors_rgb[np.minimum(label, len(labels) - 1)].astype(np.float64)
+    strength = 0.35 + 0.65 * rasters.confidence[rows, columns][..., None]
+    image[named] = (color * strength + np.array(_EMPTY_RGB) * (1 - strength))[named].round()
+    image[~named & ~np.isnan(rasters.elevation_m[rows, columns])] = _UNNAMED_RGB
+    west = (frame.min_x + columns.start) * frame.cell_m
+    south = (frame.min_y + rows.start) * frame.cell_m
+    east, north = west + label.shape[1] * frame.cell_m, south + label.shape[0] * frame.cell_m
+    ratio = label.shape[0] / label.shape[1]
     width = 11.0 if ratio < 1 else max(5.0, 9.0 / ratio)
     figure, axes = pyplot.subplots(figsize=(width, min(11.0, max(3.0, width * ratio + 1.6))))
     axes.imshow(image, origin="lower", extent=(west, east, south, north), interpolation="nearest")
-    axes.set_facecolor("white")
     axes.set_title(title)
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.ticklabel_format(useOffset=False, style="plain")
-    shown = [i for i in range(len(labels)) if (rasters.label == i).any()]
+    shown = [i for i in range(len(labels)) if (label == i).any()]
     handles = [
         Patch(facecolor=labels.colors_rgb[i] / 255.0, edgecolor="0.5", label=labels[i].name)
         for i in shown
     ]
-    handles.append(Patch(facecolor="0.84", edgecolor="0.5", label="no class"))
+    unnamed = np.array(_UNNAMED_RGB) / 255.0
+    handles.append(Patch(facecolor=unnamed, edgecolor="0.5", label="no class"))
     axes.legend(
         handles=handles,
         loc="upper center",

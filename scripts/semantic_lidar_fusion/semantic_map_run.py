@@ -34,25 +34,33 @@ def build(options: Any) -> str:
     signal.signal(signal.SIGTERM, _interrupt)
     formats = _formats(options.formats)
     costs_file = options.costs or package_file("config/map_costs.yaml")
-    with OutputFolder(options.out, options.overwrite) as output:
-        if options.live:
-            header, totals = _map_live(options, output.partial)
-        else:
-            header, totals = _map_files(options, output.partial)
-        costs = Costs.from_file(costs_file, header.labels)
-        facts = {
-            "sources": [os.path.basename(path) for path in options.inputs] or [options.live],
-            "clouds": totals.clouds,
-            "clouds_without_pose": totals.without_pose,
-            "points": totals.points,
-        }
-        title = "%s, %.3g m voxels, frame %s" % (
-            ", ".join(facts["sources"][:3]) + (", ..." if len(facts["sources"]) > 3 else ""),
-            header.config.voxel_size_m,
-            header.frame_id,
-        )
-        counts = export_map(output.partial, formats, costs, title, facts)
+    output = OutputFolder(options.out, options.overwrite)
+    try:
+        with output:
+            header, totals, counts = _fill(options, output.partial, formats, costs_file)
+    finally:
+        output.discard()
     return _report(options.out, header, totals, counts)
+
+
+def _fill(
+    options: Any, folder: str, formats: List[str], costs_file: str
+) -> Tuple[MapHeader, Totals, Dict[str, int]]:
+    """Makes the map and its exports in a folder."""
+    header, totals = (_map_live if options.live else _map_files)(options, folder)
+    costs = Costs.from_file(costs_file, header.labels)
+    facts = {
+        "sources": [os.path.basename(path) for path in options.inputs] or [options.live],
+        "clouds": totals.clouds,
+        "clouds_without_pose": totals.without_pose,
+        "points": totals.points,
+    }
+    title = "%s, %.3g m voxels, frame %s" % (
+        ", ".join(facts["sources"][:3]) + (", ..." if len(facts["sources"]) > 3 else ""),
+        header.config.voxel_size_m,
+        header.frame_id,
+    )
+    return header, totals, export_map(folder, formats, costs, title, facts)
 
 
 def _interrupt(number: int, frame: Any) -> None:
