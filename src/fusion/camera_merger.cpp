@@ -101,19 +101,11 @@ void write(const double* distribution, const PointVotes& point, std::size_t i,
            double per_log_class_count, const SoftmaxKernels& kernels, SemanticCloud* cloud) {
   const int class_count = cloud->class_count;
   float* out = &cloud->probabilities[i * static_cast<std::size_t>(class_count)];
-  for (int c = 0; c < class_count; ++c) out[c] = static_cast<float>(distribution[c]);
-  int label = 0;
-  float highest = out[0];
-  for (int c = 1; c < class_count; ++c) {
-    // Without branches: which class is the highest is hard to foretell.
-    const bool higher = out[c] > highest;
-    highest = higher ? out[c] : highest;
-    label = higher ? c : label;
-  }
+  const int label = kernels.narrow(distribution, class_count, out);
   const double entropy = kernels.entropy(distribution, class_count);
   cloud->points.status[i] = static_cast<std::uint8_t>(PointStatus::kFused);
   cloud->label[i] = static_cast<std::uint8_t>(label);
-  cloud->confidence[i] = highest;
+  cloud->confidence[i] = out[label];
   cloud->entropy[i] =
       static_cast<float>(std::min(1.0, std::max(0.0, entropy * per_log_class_count)));
   std::uint16_t cameras = 0;

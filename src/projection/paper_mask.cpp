@@ -12,6 +12,7 @@ namespace {
 struct Candidate {
   std::uint32_t distance_bits;
   std::uint32_t point;
+  std::int16_t column, row;
 };
 
 std::uint32_t bitsOf(float value) {
@@ -68,8 +69,10 @@ std::vector<std::uint8_t> visibleByPaper(const ProjectedPoints& points, const Ca
   int first_row = size.height, last_row = -1;
   for (std::size_t i = 0; i < points.size(); ++i) {
     if (!inImage(points.u[i], points.v[i], size)) continue;
-    candidates.push_back({bitsOf(points.distance[i]), static_cast<std::uint32_t>(i)});
     const int row = pixelIndex(points.v[i]);
+    candidates.push_back({bitsOf(points.distance[i]), static_cast<std::uint32_t>(i),
+                          static_cast<std::int16_t>(pixelIndex(points.u[i])),
+                          static_cast<std::int16_t>(row)});
     first_row = std::min(first_row, row);
     last_row = std::max(last_row, row);
   }
@@ -80,11 +83,10 @@ std::vector<std::uint8_t> visibleByPaper(const ProjectedPoints& points, const Ca
   const std::size_t words = static_cast<std::size_t>(last_row - first_row) / 64 + 1;
   std::vector<std::uint64_t> masked(words * static_cast<std::size_t>(size.width), 0);
   for (const Candidate& candidate : candidates) {
-    const std::uint32_t i = candidate.point;
-    const int u = pixelIndex(points.u[i]), v = pixelIndex(points.v[i]) - first_row;
+    const int u = candidate.column, v = candidate.row - first_row;
     const std::uint64_t* own = masked.data() + words * static_cast<std::size_t>(u);
     if (own[v / 64] >> (v % 64) & 1u) continue;
-    visible[i] = 1;
+    visible[candidate.point] = 1;
     const int top = std::max(0, v - half_height);
     const int bottom = std::min(last_row - first_row, v + half_height);
     for (int x = std::max(0, u - half_width); x <= std::min(size.width - 1, u + half_width); ++x) {

@@ -26,8 +26,13 @@ double exponential(double x) {
   const double rounded = x * kLog2E + kRounder;
   const double k = rounded - kRounder;
   const double r = (x - k * kLn2High) - k * kLn2Low;
-  double series = kExp[0];
-  for (int i = 1; i < 13; ++i) series = kExp[i] + r * series;
+  const double r2 = r * r, r4 = r2 * r2, r8 = r4 * r4;
+  double s[3];
+  for (int i = 0; i < 3; ++i) {
+    const double* c = kExp + 4 * i;
+    s[i] = (c[0] + c[1] * r) + (c[2] + c[3] * r) * r2;
+  }
+  const double series = (s[0] + s[1] * r4) + (s[2] + kExp[12] * r4) * r8;
   return fromBits(bitsOf(series) + (bitsOf(rounded) << 52));
 }
 
@@ -74,9 +79,18 @@ double entropy(const double* p, int count) {
   return -sumOfLanes(lanes);
 }
 
+int narrow(const double* p, int count, float* out) {
+  int label = 0;
+  for (int c = 0; c < count; ++c) {
+    out[c] = static_cast<float>(p[c]);
+    if (out[c] > out[label]) label = c;
+  }
+  return label;
+}
+
 }  // namespace
 
-const SoftmaxKernels kPlainSoftmaxKernels = {"plain", softmax, entropy};
+const SoftmaxKernels kPlainSoftmaxKernels = {"plain", softmax, entropy, narrow};
 
 const SoftmaxKernels& softmaxKernels() {
 #ifdef SLF_HAVE_AVX2

@@ -16,6 +16,9 @@ struct SoftmaxKernels {
 
   /// -sum of p ln p in nats, to 1e-11; 0 ln 0 = 0. Each p is in 0..1.
   double (*entropy)(const double* p, int count);
+
+  /// out[c] = p[c] in single precision; returns the index of the largest, the lowest of equal ones.
+  int (*narrow)(const double* p, int count, float* out);
 };
 
 extern const SoftmaxKernels kPlainSoftmaxKernels;
@@ -36,20 +39,21 @@ constexpr double kSqrt2 = 1.41421356237309504880;
 constexpr double kRounder = 6755399441055744.0;
 /// Exponents below give 0: the power of 2 would leave the range of normal numbers.
 constexpr double kLeastExponent = -708.0;
-/// 1 / 12! ... 1 / 0!
-constexpr double kExp[13] = {1.0 / 479001600.0,
-                             1.0 / 39916800.0,
-                             1.0 / 3628800.0,
-                             1.0 / 362880.0,
-                             1.0 / 40320.0,
-                             1.0 / 5040.0,
-                             1.0 / 720.0,
-                             1.0 / 120.0,
-                             1.0 / 24.0,
-                             1.0 / 6.0,
-                             0.5,
+/// 1 / 0! ... 1 / 12!, summed in pairs of ever higher powers:
+/// s0 = (c0 + c1 r) + (c2 + c3 r) r^2, s1 and s2 likewise, (s0 + s1 r^4) + (s2 + c12 r^4) r^8.
+constexpr double kExp[13] = {1.0,
                              1.0,
-                             1.0};
+                             0.5,
+                             1.0 / 6.0,
+                             1.0 / 24.0,
+                             1.0 / 120.0,
+                             1.0 / 720.0,
+                             1.0 / 5040.0,
+                             1.0 / 40320.0,
+                             1.0 / 362880.0,
+                             1.0 / 3628800.0,
+                             1.0 / 39916800.0,
+                             1.0 / 479001600.0};
 /// ln((1 + f) / (1 - f)) = f * (2 + 2 / 3 f^2 + ... + 2 / 13 f^12), highest power first.
 constexpr double kLn[7] = {2.0 / 13.0, 2.0 / 11.0, 2.0 / 9.0, 2.0 / 7.0, 2.0 / 5.0, 2.0 / 3.0, 2.0};
 

@@ -25,6 +25,13 @@ inline __m128 scoresAt(const float* scores, int c, int count) {
                        _mm_castsi128_ps(mask));
 }
 
+/// (c[0] + c[1] r) + (c[2] + c[3] r) r^2
+inline __m256d fourTerms(const double* c, __m256d r, __m256d r2) {
+  const __m256d low = _mm256_add_pd(_mm256_set1_pd(c[0]), _mm256_mul_pd(_mm256_set1_pd(c[1]), r));
+  const __m256d high = _mm256_add_pd(_mm256_set1_pd(c[2]), _mm256_mul_pd(_mm256_set1_pd(c[3]), r));
+  return _mm256_add_pd(low, _mm256_mul_pd(high, r2));
+}
+
 /// exp(x) for x <= 0.
 inline __m256d exponential(__m256d x) {
   const __m256d rounder = _mm256_set1_pd(kRounder);
@@ -32,10 +39,12 @@ inline __m256d exponential(__m256d x) {
   const __m256d k = _mm256_sub_pd(rounded, rounder);
   const __m256d r = _mm256_sub_pd(_mm256_sub_pd(x, _mm256_mul_pd(k, _mm256_set1_pd(kLn2High))),
                                   _mm256_mul_pd(k, _mm256_set1_pd(kLn2Low)));
-  __m256d series = _mm256_set1_pd(kExp[0]);
-  for (int i = 1; i < 13; ++i) {
-    series = _mm256_add_pd(_mm256_set1_pd(kExp[i]), _mm256_mul_pd(r, series));
-  }
+  const __m256d r2 = _mm256_mul_pd(r, r), r4 = _mm256_mul_pd(r2, r2), r8 = _mm256_mul_pd(r4, r4);
+  const __m256d s0 = fourTerms(kExp, r, r2), s1 = fourTerms(kExp + 4, r, r2);
+  const __m256d s2 = fourTerms(kExp + 8, r, r2);
+  const __m256d low = _mm256_add_pd(s0, _mm256_mul_pd(s1, r4));
+  const __m256d high = _mm256_add_pd(s2, _mm256_mul_pd(_mm256_set1_pd(kExp[12]), r4));
+  const __m256d series = _mm256_add_pd(low, _mm256_mul_pd(high, r8));
   const __m256i power = _mm256_slli_epi64(_mm256_castpd_si256(rounded), 52);
   const __m256d value = _mm256_castsi256_pd(_mm256_add_epi64(_mm256_castpd_si256(series), power));
   return _mm256_and_pd(value, _mm256_cmp_pd(x, _mm256_set1_pd(kLeastExponent), _CMP_GE_OQ));
@@ -118,8 +127,31 @@ double entropy(const double* p, int count) {
   return -sumOfLanes(sums);
 }
 
+int narrow(const double* p, int count, float* out) {
+  __m128 high = _mm_set1_ps(-__builtin_inff());
+  int c = 0;
+  for (; c + 4 <= count; c += 4) {
+    const __m128 value = _mm256_cvtpd_ps(_mm256_loadu_pd(p + c));
+    _mm_storeu_ps(out + c, value);
+    high = _mm_max_ps(high, value);
+  }
+  for (; c < count; ++c) {
+    out[c] = static_cast<float>(p[c]);
+    high = _mm_max_ps(high, _mm_set1_ps(out[c]));
+  }
+  high = _mm_max_ps(high, _mm_movehl_ps(high, high));
+  high = _mm_max_ss(high, _mm_shuffle_ps(high, high, 1));
+  high = _mm_shuffle_ps(high, high, 0);
+  for (c = 0; c + 4 <= count; c += 4) {
+    const int equal = _mm_movemask_ps(_mm_cmpeq_ps(_mm_loadu_ps(out + c), high));
+    if (equal != 0) return c + __builtin_ctz(static_cast<unsigned>(equal));
+  }
+  while (c + 1 < count && out[c] != _mm_cvtss_f32(high)) ++c;
+  return c;
+}
+
 }  // namespace
 
-const SoftmaxKernels kAvx2SoftmaxKernels = {"avx2", softmax, entropy};
+const SoftmaxKernels kAvx2SoftmaxKernels = {"avx2", softmax, entropy, narrow};
 
 }  // namespace semantic_lidar_fusion

@@ -201,7 +201,7 @@ void fuseRig(benchmark::State& state, OcclusionMode mode) {
   const SemanticProjector projector(config);
   std::size_t fused = 0;
   for (auto _ : state) {
-    const FusionResult result = projector.fuse(scan(), views);
+    const FusionResult result = projector.fuse(scan(), views, false);
     fused = static_cast<std::size_t>(
         std::count(result.cloud.points.status.begin(), result.cloud.points.status.end(), 0));
     benchmark::DoNotOptimize(result.cloud.probabilities.data());

@@ -113,6 +113,22 @@ TEST_P(Kernels, EntropyFollowsTheDefinition) {
   }
 }
 
+TEST_P(Kernels, NarrowGivesTheFirstOfTheLargest) {
+  std::mt19937 random(5);
+  for (int count = 1; count <= 40; ++count) {
+    for (int trial = 0; trial < 50; ++trial) {
+      const auto n = static_cast<std::size_t>(count);
+      const std::unique_ptr<double[]> p(new double[n]);
+      const std::unique_ptr<float[]> out(new float[n]);
+      // Few different values, some of which only doubles tell apart.
+      for (int c = 0; c < count; ++c) p[c] = 0.1 * (random() % 4) + 1e-12 * (random() % 3);
+      const int label = GetParam()->narrow(p.get(), count, out.get());
+      for (int c = 0; c < count; ++c) EXPECT_EQ(out[c], static_cast<float>(p[c]));
+      EXPECT_EQ(label, std::max_element(out.get(), out.get() + count) - out.get());
+    }
+  }
+}
+
 INSTANTIATE_TEST_SUITE_P(All, Kernels, testing::ValuesIn(usable()),
                          [](const auto& info) { return std::string(info.param->name); });
 
