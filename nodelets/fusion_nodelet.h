@@ -19,6 +19,7 @@
 #include <memory>
 #include <mutex>
 #include <string>
+#include <utility>
 
 #include "health.h"
 #include "semantic_lidar_fusion/config/rig.h"
@@ -152,7 +153,8 @@ class FusionNodelet : public nodelet::Nodelet {
   void onInit() final;
   bool mayReport(const std::string& key);
   void watch();
-
+  /// The simulated clock and how long it has stood still, both in ns.
+  std::pair<StampNs, StampNs> simulatedClock() const;
   void keepQueues();
 
   /// A callback that runs while the nodelet is unloaded holds it until it returns, and the manager

@@ -31,6 +31,10 @@ the truth beside it. config/demo.yaml is its rig. The same options give the same
   /gmsl/*/labels_truth     class ids of the images that scans use
   /truth/poses             where the vehicle really is
 
+Scores imitate ENet at a stride of 8 full-size pixels, for the images that scans use: its borders,
+confusions, thin things and overconfidence, as measured on labelled CamVid photos by
+test/benchmark/network_errors.py. Compare: network_errors.py --bag BAG.
+
 options:
   --out BAG            the bag to write (required)
   --duration S         0.2 to 300 (default 2)
@@ -38,7 +42,7 @@ options:
   --seed N             another street, other noise (default 1)
   --scale F            image size, 0.1 to 1 times 1920 x 1208 (default 0.5)
   --width PIXELS       the same, by the images' width
-  --camera-drop M      cameras below the lidar, -1 to 1.2 (default 0.2)
+  --camera-drop M      cameras below the lidar, -1 to 1.2 (default 0.2); also --lidar-offset
   --image-rate HZ      1 to 100 (default 30)
   --images all|selected  also render images that no scan uses (default selected)
   --raw                images as sensor_msgs/Image, not JPEG (set transport: raw in the rig)

@@ -43,6 +43,12 @@ def make_parser():
         help="score the clouds of this bag instead of running fuse_bag; repeatable, in the order "
         "of the table's columns",
     )
+    parser.add_argument(
+        "--live",
+        metavar="BAG",
+        help="score this bag too, recorded from the nodelets (replay.launch record:=...), and say "
+        "how many of its clouds equal those of the last column",
+    )
     parser.add_argument("--truth", metavar="BAG", help="bag with points_truth (default: IN.bag)")
     parser.add_argument(
         "--set",
@@ -116,7 +122,7 @@ def check(parser, options):
         for name in ("model", "classes"):
             if not getattr(options, name):
                 parser.error("--images needs --" + name)
-        for name in ("rig", "truth", "clouds", "fit_on"):
+        for name in ("rig", "truth", "clouds", "fit_on", "live"):
             if getattr(options, name):
                 parser.error("--images and --%s exclude each other" % name.replace("_", "-"))
     elif not options.rig and not options.clouds:

@@ -15,6 +15,7 @@
 #include <cmath>
 #include <cstdio>
 #include <cstring>
+#include <iterator>
 #include <map>
 #include <memory>
 #include <opencv2/imgcodecs.hpp>
@@ -43,6 +44,7 @@ constexpr double kOdometryHz = 100.0;
 constexpr double kOdometryMarginS = 0.4;  // before and after the drive
 constexpr double kImageMarginS = 0.1;
 constexpr double kImagePhaseS = 0.0113;  // images keep no step with the lidar
+constexpr int kReferenceCamera = 0;
 constexpr StampNs kScoreDelayNs = 40000000;
 constexpr int kScoreStride = 8;  // full-resolution pixels a cell
 // A car's wheel encoders and gyroscope.
@@ -321,6 +323,10 @@ class Simulation {
     }
     addImagesUntil(images_.back());
     take(selector.finish());
+    // Live, the choice for the last scan is settled by a later image of the reference camera.
+    const auto later = std::upper_bound(images_.begin(), images_.end(),
+                                        used_.empty() ? kStartNs : std::prev(used_.end())->first);
+    if (later != images_.end()) used_[*later][kReferenceCamera];
     if (!options_.all_images) {
       images_.erase(std::remove_if(images_.begin(), images_.end(),
                                    [&](StampNs stamp) { return used_.count(stamp) == 0; }),

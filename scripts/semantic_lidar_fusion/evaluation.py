@@ -391,6 +391,21 @@ def mask_visibility(unmasked: FusedBag, masked: FusedBag, truth: Truth) -> Optio
     return result
 
 
+def compare_clouds(offline: FusedBag, live: FusedBag) -> Tuple[int, int, int]:
+    """Scans that both bags have, those whose clouds are equal byte for byte, scans of `offline`."""
+
+    def contents(fused: FusedBag) -> Dict[int, bytes]:
+        with BagReader(fused.path) as bag:
+            return {
+                to_ns(item.message.header.stamp): bytes(item.message.data)
+                for item in bag.read([CLOUD_TOPIC])
+            }
+
+    wanted, got = contents(offline), contents(live)
+    both = [stamp for stamp in wanted if stamp in got]
+    return len(both), sum(wanted[stamp] == got[stamp] for stamp in both), len(wanted)
+
+
 def samples_of(
     fused: FusedBag, truth: Truth, labels: LabelSet, parity: Optional[int]
 ) -> Tuple[np.ndarray, np.ndarray]:

@@ -42,6 +42,14 @@ class Results:
         self.plots.append(("confusion.png", plotting.draw_confusions, (rows, shown, confusions)))
         self.plots.append(("reliability.png", plotting.draw_reliability, (reliabilities,)))
 
+    def add_live(self, same: Tuple[int, int, int], name: str) -> None:
+        """same: scans that both have, those that are equal byte for byte, scans offline."""
+        self.sections += [
+            "## Live\n",
+            "%d of %d scans came out live; %d of them equal those of %s byte for byte.\n"
+            % (same[0], same[2], same[1], name),
+        ]
+
     def add_temperatures(self, compared: Sequence[Tuple[Variant, Score]], note: str) -> None:
         best = min(compared, key=lambda entry: entry[1].reliability.nll)[0]
         self.sections += [
@@ -112,15 +120,20 @@ def _evaluate_drive(options: Any, results: Results, workspace: str) -> str:
             settings = common + list(configuration.settings)
             evaluation.run_fuse_bag(program, options.bag, target, rig.path, settings)
             bags.append((configuration.name, target))
+    pair = tables.mask_pair([name for name, _ in bags])
+    if options.live:
+        bags.append(("live", options.live))
     fused = [FusedBag(path, labels.names) for _, path in bags]
     scores = [
         evaluation.score_bag(name, bag, truth, labels, options.min_edge_px)
         for (name, _), bag in zip(bags, fused)
     ]
     rates = None
-    if tables.unmasked_of(scores) is not None:
-        rates = evaluation.mask_visibility(fused[-2], fused[-1], truth)
+    if pair is not None:
+        rates = evaluation.mask_visibility(fused[pair[0]], fused[pair[1]], truth)
     results.add_scores(scores, rates)
+    if options.live:
+        results.add_live(evaluation.compare_clouds(fused[-2], fused[-1]), bags[-2][0])
     if options.fit_temperature:
         assert rig is not None
         fit_bag = options.fit_on or options.bag

@@ -104,18 +104,20 @@ _SUMMARY = (
 )
 
 
-def unmasked_of(scores: Sequence[Score]) -> Optional[Score]:
-    """The run against which the mask's removals are counted: the one before the last."""
-    return scores[-2] if len(scores) > 1 and "mask" in scores[-1].name else None
+def mask_pair(names: Sequence[str]) -> Optional[Tuple[int, int]]:
+    """The runs that differ in the mask alone: the last one named for it, and the one before."""
+    masked = [index for index, name in enumerate(names) if index and "mask" in name]
+    return (masked[-1] - 1, masked[-1]) if masked else None
 
 
 def _summary_rows(scores: Sequence[Score]) -> List[List[Any]]:
-    unmasked = unmasked_of(scores)
+    pair = mask_pair([score.name for score in scores])
     rows: List[List[Any]] = []
-    for score in scores:
+    for index, score in enumerate(scores):
         removed = float("nan")
-        if unmasked is not None and score is scores[-1]:
-            removed = float(ratio(unmasked.labelled - score.labelled, unmasked.labelled))
+        if pair is not None and index == pair[1]:
+            before = scores[pair[0]].labelled
+            removed = float(ratio(before - score.labelled, before))
         rows.append(
             [score.name, score.scans, score.points, score.labelled, removed]
             + [int(count) for count in score.status[1:]]
