@@ -119,7 +119,7 @@ def cpu_per_scan(log, begin, end):
 
 
 def evaluate(manager, player_log, alone, shared):
-    """One row of figures from the logs of the manager and of the player, in one process if `shared`."""
+    """One row of figures from the logs of manager and player; `shared`: they are one process."""
     player = player_log["player"]
     begin = player["start"] + int(1e9 * WARM_UP)
     deliveries = player["deliveries"]
