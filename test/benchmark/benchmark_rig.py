@@ -107,6 +107,7 @@ def quantile(values, share):
 
 
 def between(samples, begin, end):
+    """Those whose moment, their first entry, lies between two."""
     return [s for s in samples if begin <= s[0] <= end]
 
 
@@ -155,7 +156,9 @@ def evaluate(manager, player_log, alone, shared):
     samples = between(manager["samples"], begin, end)
     total = cpu_per_scan(manager, begin, end)
     # The copies that the player makes of messages which are still held are its own affair.
-    playing = alone + 1e3 * player["copy_cpu_s"] / player["scans"] if shared else 0.0
+    copies = between(player["copies"], samples[0][0], samples[-1][0])
+    periods = 1e-9 * (samples[-1][0] - samples[0][0]) / SCAN_PERIOD
+    playing = alone + 1e3 * sum(c[1] for c in copies) / periods if shared else 0.0
     return {
         "cpu_ms_per_scan": total - playing,
         "player_ms_per_scan": playing,
@@ -165,7 +168,7 @@ def evaluate(manager, player_log, alone, shared):
         "scans": len(counted),
         "scans_lost": lost,
         "fused_points_per_scan": quantile(fused, 0.5),
-        "copies_by_player": player["copies"],
+        "copies_by_player": len(copies),
         "largest_lag_of_player_ms": 1e-6 * player["largest_lag_ns"],
     }
 

@@ -230,8 +230,7 @@ boost::shared_ptr<M> RigPlayer::owned(boost::shared_ptr<M>* message) {
   if (message->use_count() > 1) {
     const double cpu_start = threadCpuSeconds();
     *message = boost::make_shared<M>(**message);
-    ++copy_count_;
-    copy_cpu_s_ += threadCpuSeconds() - cpu_start;
+    copies_.push_back({steadyNs(), threadCpuSeconds() - cpu_start});
   }
   return *message;
 }
@@ -289,7 +288,7 @@ void RigPlayer::publishImage(Camera* camera, const Event& event, StampNs stamp) 
       const double cpu_start = threadCpuSeconds();
       fillers->push_back(boost::make_shared<Message>(*images->front().message));
       message = &fillers->back();
-      copy_cpu_s_ += threadCpuSeconds() - cpu_start;
+      copies_.push_back({steadyNs(), threadCpuSeconds() - cpu_start});
     }
     const auto image = owned(message);
     image->header.stamp = rosTime(stamp);
