@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 FUSED, OCCLUDED, OUTSIDE, NO_IMAGE, NO_ODOMETRY = range(5)
 PRECEDENCE = {FUSED: 0, OCCLUDED: 1, NO_IMAGE: 2, OUTSIDE: 3}
 
-# Velodyne's manuals: elevation of each laser in the order of the data, and azimuth offset (VLP-32C).
+# Velodyne's manuals: elevation of each laser in the order of the data; VLP-32C: azimuth offset too.
 VLP16_DEG = [-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15]
 HI_RES_DEG = [(-10 if i % 2 == 0 else 2 / 3) + i // 2 * 4 / 3 for i in range(16)]
 HDL32E_DEG = [-30.67, -9.33, -29.33, -8, -28, -6.67, -26.67, -5.33, -25.33, -4, -24, -2.67]
