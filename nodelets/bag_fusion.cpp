@@ -245,7 +245,7 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
       ++state.none;
     }
   }
-  const FusionResult result = chain_.fused(rigid.cloud, views);
+  const FusionResult result = chain_.fused(rigid.cloud, views, options_.all);
   const auto compensated = compensatedCloudMessage(rigid.cloud);
   const auto semantic = semanticCloudMessage(result.cloud, rig_.classes);
 

@@ -10,6 +10,7 @@
 #include <utility>
 
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/thread_pool.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 
 namespace semantic_lidar_fusion {
@@ -415,6 +416,7 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
                                {"nearest_in_time", OverlapRule::kNearestInTime},
                                {"most_central", OverlapRule::kMostCentral}});
   section.boolean("keep_unlabelled", &rig.keep_unlabelled);
+  section.integer("threads", &rig.threads, 1, ThreadPool::kMaxThreads);
   section.finish();
   for (const std::string& problem : own) problems->push_back(source_name + ": " + problem);
   return rig;

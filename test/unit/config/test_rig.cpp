@@ -70,6 +70,7 @@ TEST(RigTest, EmptyRigHasTheDefaultsOfTheStructs) {
   EXPECT_EQ(rig.lidar.without_time, WithoutTime::kInstant);
   EXPECT_EQ(rig.overlap, OverlapRule::kMean);
   EXPECT_TRUE(rig.keep_unlabelled);
+  EXPECT_EQ(rig.threads, 1);
   EXPECT_EQ(CameraConfig().max_time_difference_s, 0.05);
 }
 
@@ -117,6 +118,7 @@ occlusion: {mode: paper, vertical_step_deg: 2, horizontal_step_deg: 0.1, depth_m
             depth_margin_ratio: 0.2}
 overlap: most_central
 keep_unlabelled: false
+threads: 3
 )");
   EXPECT_EQ(rig.name, "vehicle");
   EXPECT_EQ(rig.classes.size(), 1);
@@ -181,6 +183,7 @@ keep_unlabelled: false
   EXPECT_EQ(rig.occlusion.depth_margin_ratio, 0.2);
   EXPECT_EQ(rig.overlap, OverlapRule::kMostCentral);
   EXPECT_FALSE(rig.keep_unlabelled);
+  EXPECT_EQ(rig.threads, 3);
 
   const CompensationConfig compensation = rig.compensationConfig();
   EXPECT_FALSE(compensation.enabled);
@@ -253,6 +256,7 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
             "nearest_in_time, most_central"},
            {"overlap: [mean]", "rig.yaml: overlap = (a list of 1): must be one of mean"},
            {"keep_unlabelled: maybe", "rig.yaml: keep_unlabelled = maybe: must be true or false"},
+           {"threads: 0", "rig.yaml: threads = 0: must be a whole number from 1 to 64"},
            {"keep_unlabelled: 1", "rig.yaml: keep_unlabelled = 1: must be true or false"},
            {"fixed_frame: ''", "rig.yaml: fixed_frame = '': must be a tf frame"},
            {"fixed_frame: a b", "rig.yaml: fixed_frame = a b: must be a tf frame"},
