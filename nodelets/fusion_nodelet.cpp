@@ -19,8 +19,13 @@ const ros::WallDuration kDiagnosticsPeriod(1.0);
 constexpr std::chrono::seconds kReportPeriod{30};
 /// Silence after which the watchdog speaks.
 constexpr std::chrono::seconds kSilence{5};
+constexpr auto kEver = std::chrono::duration<double>::max();
 /// A clock that stands still for longer is taken for the end of a bag.
 constexpr StampNs kClockStall = 3 * kNsPerSecond;
+
+const char* const kSilentClock = "use_sim_time is true but /clock is silent; play with --clock";
+
+bool clockIsSilent() { return ros::Time::isSimTime() && ros::Time::now().isZero(); }
 
 /// Number of single-letter edits that make b of a (Levenshtein).
 std::size_t editDistance(const std::string& a, const std::string& b) {
@@ -82,12 +87,18 @@ void FusionNodelet::keepQueues() {
 void FusionNodelet::onInit() {
   keepQueues();
   try {
+    for (const std::string& problem : unknownParameters(getPrivateNodeHandle())) {
+      NODELET_WARN_STREAM(problem);
+    }
     rig_ = loadRigFromParameters(getPrivateNodeHandle());
     diagnostics_ = std::make_unique<diagnostic_updater::Updater>(getNodeHandle(),
                                                                  getPrivateNodeHandle(), getName());
     diagnostics_->setHardwareID(rig_.name.empty() ? "none" : rig_.name);
     diagnostics_->add("fusion", [this](diagnostic_updater::DiagnosticStatusWrapper& status) {
       health_.fill(status);
+      if (clockIsSilent()) {
+        status.mergeSummary(diagnostic_msgs::DiagnosticStatus::STALE, kSilentClock);
+      }
     });
     {
       // Listeners may connect while publishers are still being set up.
@@ -116,15 +127,20 @@ void FusionNodelet::startTicking() {
 }
 
 StampNs FusionNodelet::now() const {
+  if (!ros::Time::isSimTime()) return static_cast<StampNs>(ros::SteadyTime::now().toNSec());
+  const auto [clock_ns, stood_still_ns] = simulatedClock();
+  return clock_ns + std::max<StampNs>(0, stood_still_ns - kClockStall);
+}
+
+std::pair<StampNs, StampNs> FusionNodelet::simulatedClock() const {
   const auto steady_ns = static_cast<StampNs>(ros::SteadyTime::now().toNSec());
-  if (!ros::Time::isSimTime()) return steady_ns;
   const auto clock_ns = static_cast<StampNs>(ros::Time::now().toNSec());
   std::lock_guard<std::mutex> lock(clock_mutex_);
   if (clock_ns != clock_ns_) {
     clock_ns_ = clock_ns;
     clock_changed_ns_ = steady_ns;
   }
-  return clock_ns + std::max<StampNs>(0, steady_ns - clock_changed_ns_ - kClockStall);
+  return {clock_ns, steady_ns - clock_changed_ns_};
 }
 
 void FusionNodelet::guard(const std::string& where, const std::function<void()>& work) {
@@ -137,6 +153,13 @@ void FusionNodelet::guard(const std::string& where, const std::function<void()>&
     health_.count("dropped: error in " + where);
     error(where, where + ": unknown exception");
   }
+}
+
+void FusionNodelet::reportOverflow(const std::string& topic) {
+  health_.count("dropped: queue full, " + topic);
+  warn("overflow " + topic, topic +
+                                ": messages come faster than they are worked off; the oldest "
+                                "are dropped");
 }
 
 bool FusionNodelet::mayReport(const std::string& key) {
@@ -159,20 +182,23 @@ void FusionNodelet::error(const std::string& key, const std::string& text) {
 
 void FusionNodelet::watch() {
   diagnostics_->force_update();
+  const bool is_halted = ros::Time::isSimTime() && simulatedClock().second > kClockStall;
   const auto now = Health::Clock::now();
   if (now - started_ < kSilence || now - watched_ < kSilence) return;
   watched_ = now;
   const bool is_silent = !health_.publishedWithin(kSilence);
-  if (is_silent && ros::Time::isSimTime() && ros::Time::now().isZero()) {
-    warn("clock", "use_sim_time is true but /clock is silent; play with --clock");
+  if (is_silent && clockIsSilent()) {
+    warn("clock", kSilentClock);
     return;
   }
   const std::string idle = explainSilence();
-  if (is_silent && !idle.empty()) {
+  if (is_silent && !is_halted && !idle.empty()) {
     warn("idle", "nothing published for 5 s: " + idle);
     return;
   }
-  const std::vector<std::string> silent = health_.silentInputs(kSilence);
+  // A bag that is paused or has ended is no news; what it never held is.
+  const std::vector<std::string> silent =
+      health_.silentInputs(is_halted ? kEver : std::chrono::duration<double>(kSilence));
   if (silent.empty()) return;
   ros::master::V_TopicInfo topics;
   ros::master::getTopics(topics);
@@ -180,7 +206,7 @@ void FusionNodelet::watch() {
   for (const auto& topic : silent) {
     // While something is published, only what nobody advertises is worth a line: a camera that is
     // merely late is counted where it is missed.
-    if (!is_silent && isAdvertised(topic, topics)) continue;
+    if ((!is_silent || is_halted) && isAdvertised(topic, topics)) continue;
     reasons += (reasons.empty() ? "" : "; ") + describeSilentTopic(topic, topics);
   }
   if (reasons.empty()) return;

@@ -42,7 +42,7 @@ class Health {
   void error(const std::string& text);
 
   std::uint64_t counted(const std::string& reason) const;
-  /// Expected inputs that have had no message for `age`, or never.
+  /// Expected inputs that have had no message for `age`, or never; with the longest age only these.
   std::vector<std::string> silentInputs(std::chrono::duration<double> age) const;
   bool publishedWithin(std::chrono::duration<double> age) const;
 

@@ -85,6 +85,10 @@ class MotionCompensationNodelet : public FusionNodelet {
     reportTimeDecision();
     scan.interval = scanInterval(scan.cloud);
     scan.arrived_ns = now();
+    if (scan.interval.first_ns <= 0) {  // the selection nodelet says it; it is no jump of time
+      health().count("dropped: scan of stamp 0");
+      return;
+    }
     if (!current("lidar", scan.interval.first_ns)) return;
     pending_.push_back(std::move(scan));
     if (pending_.size() > kMaxPendingScans) {
@@ -143,8 +147,8 @@ class MotionCompensationNodelet : public FusionNodelet {
         empty.frame_id = scan.cloud.frame_id;
         empty.stamp = empty.first_point_ns = scan.cloud.header_stamp;
         health().count("empty scans");
-        publish(output_, compensatedCloudMessage(empty));
         pending_.pop_front();
+        publish(output_, compensatedCloudMessage(empty));
         continue;
       }
       const Reference* reference = references_.find(scan.interval.first_ns);
@@ -173,8 +177,9 @@ class MotionCompensationNodelet : public FusionNodelet {
                              std::to_string(rig().odometry.timeout_s) +
                              " s: " + (T_vehicle_lidar ? gap : T_vehicle_lidar.message));
       }
-      publishCompensated(scan, t_ref, T_vehicle_lidar);
-      pending_.pop_front();
+      const Scan leaving = std::move(pending_.front());
+      pending_.pop_front();  // first: an error must not meet it again
+      publishCompensated(leaving, t_ref, T_vehicle_lidar);
     }
   }
 

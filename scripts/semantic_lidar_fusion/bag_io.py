@@ -9,7 +9,18 @@ read and written whether or not that package is installed.
 import os
 import struct
 from types import TracebackType
-from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Type
+from typing import (
+    Any,
+    Dict,
+    Iterable,
+    Iterator,
+    List,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Tuple,
+    Type,
+)
 
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.errors import DataError
@@ -84,6 +95,14 @@ def message_class(type_name: str) -> Any:
     return _generated[type_name]
 
 
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _absolute(topic: str) -> str:
+    return topic if topic.startswith("/") else "/" + topic
+
+
 class BagMessage(NamedTuple):
     """One message of a bag, with its record time (ns)."""
 
@@ -92,10 +111,30 @@ class BagMessage(NamedTuple):
     stamp_ns: int
 
 
+class RawMessage(NamedTuple):
+    """A message as the bag holds it, of whatever type. `connection`: its connection header."""
+
+    topic: str
+    content: Tuple[Any, ...]
+    stamp_ns: int
+    connection: Dict[str, Any]
+
+    @property
+    def latched(self) -> bool:
+        return str(self.connection.get("latching", "0")) == "1"
+
+    def message(self) -> Any:
+        """Decoded by the definition that the bag brings along."""
+        message = self.content[-1]()
+        message.deserialize(self.content[1])
+        return message
+
+
 class BagReader:
     """A bag open for reading, as a context manager.
 
-    topics: topic -> message type, for every topic of the bag.
+    topics: topic -> message type, for every topic of the bag. Names begin with a slash, which
+    `rosbag record` leaves away where its command line does.
     """
 
     def __init__(self, path: str):
@@ -115,8 +154,14 @@ class BagReader:
         except (rosbag.ROSBagException, struct.error, ValueError, KeyError) as error:
             raise DataError("%s: not a readable bag (%s)" % (path, error)) from error
         information = self._bag.get_type_and_topic_info()[1]
-        self.topics: Dict[str, str] = {name: entry[0] for name, entry in information.items()}
-        self._counts = {name: int(entry[1]) for name, entry in information.items()}
+        self.topics: Dict[str, str] = {}
+        self._counts: Dict[str, int] = {}
+        self._recorded_names: Dict[str, List[str]] = {}
+        for name, entry in information.items():
+            topic = _absolute(name)
+            self.topics[topic] = entry[0]
+            self._counts[topic] = self._counts.get(topic, 0) + int(entry[1])
+            self._recorded_names.setdefault(topic, []).append(name)
 
     def __enter__(self) -> "BagReader":
         return self
@@ -176,7 +221,7 @@ class BagReader:
         import rosbag
 
         entries: Iterable[Any] = self._bag.read_messages(
-            topics=names,
+            topics=[recorded for name in names for recorded in self._recorded_names[name]],
             start_time=None if start_ns is None else to_stamp(start_ns),
             end_time=None if end_ns is None else to_stamp(end_ns),
         )
@@ -184,7 +229,23 @@ class BagReader:
             entries = cli.progress(entries, self.count(names), label)
         try:
             for topic, message, stamp in entries:
-                yield BagMessage(topic, message, to_ns(stamp))
+                yield BagMessage(_absolute(topic), message, to_ns(stamp))
+        except (rosbag.ROSBagException, struct.error, OSError, EOFError) as error:
+            raise DataError("%s: damaged (%s)" % (self.path, error)) from error
+
+    def read_raw(self, label: Optional[str] = None) -> Iterator[RawMessage]:
+        """All messages in order of record time, not decoded; `label` as in read()."""
+        import rosbag
+
+        entries: Iterable[Any] = self._bag.read_messages(raw=True, return_connection_header=True)
+        if label is not None:
+            entries = cli.progress(entries, self.count(), label)
+        try:
+            for entry in entries:
+                header = {key: _text(value) for key, value in entry.connection_header.items()}
+                yield RawMessage(
+                    _absolute(entry.topic), entry.message, to_ns(entry.timestamp), header
+                )
         except (rosbag.ROSBagException, struct.error, OSError, EOFError) as error:
             raise DataError("%s: damaged (%s)" % (self.path, error)) from error
 
@@ -256,6 +317,19 @@ class BagWriter:
             }
         try:
             self._bag.write(topic, message, to_stamp(stamp_ns), connection_header=header)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def write_raw(self, item: RawMessage) -> None:
+        """Appends a message of another bag as it is."""
+        try:
+            self._bag.write(
+                item.topic,
+                item.content,
+                to_stamp(item.stamp_ns),
+                raw=True,
+                connection_header=dict(item.connection, topic=item.topic),
+            )
         except OSError as error:
             raise self._failed(error) from error
 

@@ -87,6 +87,17 @@ def _write_temporary(file: bag_io.AtomicFile, text: str) -> None:
         ) from error
 
 
+def _wait_s(drive: records.Drive) -> float:
+    """How long a scan may have to wait live, s: it comes to the bag at its start, and what it waits
+    for may be as rare as the slowest of the others, with as much again for a machine that is busy.
+    """
+    tracks = [[image.stamp_ns for image in camera.images] for camera in drive.cameras]
+    if drive.odometry is not None:
+        tracks.append([int(stamp) for stamp in drive.odometry[0]])
+    periods = [float(np.median(np.diff(track))) * 1e-9 for track in tracks if len(track) > 1]
+    return round(min(1.0, 0.1 + 2 * max(periods, default=0.0)), 2)
+
+
 def rig_tree(drive: records.Drive, rig_path: str, options: Options) -> Dict[str, Any]:
     """The rig file's contents; keys that have their default are left out."""
     cameras = []
@@ -106,8 +117,12 @@ def rig_tree(drive: records.Drive, rig_path: str, options: Options) -> Dict[str,
         "fixed_frame": FIXED_FRAME,
         "vehicle_frame": VEHICLE_FRAME,
         "motion": {"enabled": drive.motion_enabled},
-        "odometry": {"source": "tf"},
-        "reference": {"choose": "closest_image", "camera": drive.cameras[0].name},
+        "odometry": {"source": "tf", "timeout": _wait_s(drive)},
+        "reference": {
+            "choose": "closest_image",
+            "camera": drive.cameras[0].name,
+            "timeout": _wait_s(drive),
+        },
     }
     if options.model:
         folder = os.path.dirname(os.path.abspath(rig_path))
@@ -115,7 +130,7 @@ def rig_tree(drive: records.Drive, rig_path: str, options: Options) -> Dict[str,
     return tree
 
 
-class _RigDumper(yaml.SafeDumper):
+class RigDumper(yaml.SafeDumper):
     """Short lists and mappings on one line, as the shipped files have them."""
 
 
@@ -123,13 +138,13 @@ def _is_flat(values: Any) -> bool:
     return all(not isinstance(value, (dict, list)) for value in values)
 
 
-_RigDumper.add_representer(
+RigDumper.add_representer(
     list,
     lambda dumper, data: dumper.represent_sequence(
         "tag:yaml.org,2002:seq", data, flow_style=_is_flat(data)
     ),
 )
-_RigDumper.add_representer(
+RigDumper.add_representer(
     dict,
     lambda dumper, data: dumper.represent_mapping(
         "tag:yaml.org,2002:map",
@@ -147,7 +162,7 @@ def rig_text(drive: records.Drive, rig_path: str, options: Options) -> str:
     lines = ["# Written by import_dataset.py. Every key is explained in config/usyd.yaml."]
     lines += ["# " + note for note in drive.notes]
     tree = rig_tree(drive, rig_path, options)
-    text = yaml.dump(tree, Dumper=_RigDumper, sort_keys=False, width=100, default_flow_style=False)
+    text = yaml.dump(tree, Dumper=RigDumper, sort_keys=False, width=100, default_flow_style=False)
     return "\n".join(lines) + "\n" + text
 
 

@@ -50,10 +50,12 @@ def test_xml_files_parse():
 
 
 def test_files_that_launch_files_name_exist():
+    """Executables are found by their name alone, wherever the build has put them."""
     own = re.compile(r"\$\(find semantic_lidar_fusion\)/([\w./-]+\.\w+)")
     for path in files("launch/**/*.launch"):
         for name in own.findall(text_of(path)):
-            assert os.path.exists(os.path.join(SOURCE_DIR, name)), "%s: no %s" % (path, name)
+            places = [os.path.join(SOURCE_DIR, folder, name) for folder in ("", "scripts")]
+            assert any(map(os.path.exists, places)), "%s: no %s" % (path, name)
 
 
 ARGUMENTS = ["rig:=config/kitti.yaml", "bag:=in.bag", "manager:=some_manager", "record:=out.bag"]
@@ -81,13 +83,36 @@ def test_launch_files_load_with_every_argument_documented(path):
     for name, argument in arguments.items():
         assert argument.get("doc") or argument.get("value") is not None, "%s: no doc" % name
     wanted = [a for a in ARGUMENTS if a.split(":=")[0] in arguments]
-    assert "/" in roslaunch("--nodes", path, "bond:=true", *wanted)
-    parameters = yaml.safe_load(roslaunch("--dump-params", path, "bond:=false", *wanted))
+    bonds = {"true": [], "false": []}
+    if "bond" in arguments:
+        bonds = {value: ["bond:=" + value] for value in bonds}
+    assert "/" in roslaunch("--nodes", path, *bonds["true"] + wanted)
+    parameters = yaml.safe_load(roslaunch("--dump-params", path, *bonds["false"] + wanted)) or {}
     rigs = {value for key, value in parameters.items() if key.endswith("/rig_file")}
     if "rig" not in arguments:
         assert not rigs
         return
     assert rigs and {os.path.basename(rig) for rig in rigs} == {"kitti.yaml"}
+
+
+def test_rviz_shows_topics_that_the_chain_publishes():
+    """Topics of its configuration stand in the launch file, which joins them to the chain's."""
+    config = yaml.load(
+        text_of(os.path.join(SOURCE_DIR, "launch", "fusion.rviz")), Loader=UniqueKeys
+    )
+    displays = config["Visualization Manager"]["Displays"]
+    shown = {d.get("Topic") or d.get("Image Topic") for d in displays} - {None}
+    launch = ET.parse(os.path.join(SOURCE_DIR, "launch", "rviz.launch"))
+    remaps = {r.get("from"): r.get("to") for r in launch.iter("remap")}
+    assert shown == set(remaps)
+    nodelets = "".join(text_of(path) for path in files("nodelets/*_nodelet.cpp"))
+    for name in remaps.values():
+        assert '"%s"' % name.split("/")[-1] in nodelets, name
+    channels = {d["Channel Name"] for d in displays if "Channel Name" in d}
+    assert channels == {"p_road"}
+    for name in ("usyd12", "cityscapes", "camvid12"):
+        classes = yaml.safe_load(text_of(os.path.join(SOURCE_DIR, "config/classes_%s.yaml" % name)))
+        assert "road" in [c["name"] for c in classes["classes"]]
 
 
 @pytest.mark.skipif(not shutil.which("roslaunch"), reason="roslaunch is not installed")

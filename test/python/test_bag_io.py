@@ -51,6 +51,22 @@ def test_latched_topics_say_so(tmp_path):
     assert latching["/text"] in (b"1", "1") and not latching["/number"]
 
 
+def test_names_without_a_leading_slash_are_those_with_one(tmp_path):
+    """`rosbag record number` writes the topic's name as it was given."""
+    import rosbag
+
+    path = str(tmp_path / "a.bag")
+    with rosbag.Bag(path, "w") as bag:
+        bag.write("number", Int32(1), bag_io.to_stamp(1))
+        bag.write("/number", Int32(2), bag_io.to_stamp(2))
+    with bag_io.BagReader(path) as reader:
+        assert reader.topics == {"/number": "std_msgs/Int32"}
+        reader.require_topic("/number")
+        assert reader.count(["/number"]) == 2
+        found = [(e.topic, e.message.data) for e in reader.read(["/number"])]
+    assert found == [("/number", 1), ("/number", 2)]
+
+
 def test_stamps():
     for stamp_ns in (0, 1, 999999999, 10**9, 1546300800123456789):
         assert bag_io.to_ns(bag_io.to_stamp(stamp_ns)) == stamp_ns

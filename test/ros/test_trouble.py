@@ -4,7 +4,6 @@
 
 One manager serves all cases, in the order of their names; its process id must not change.
 """
-import copy
 import os
 import sys
 import unittest
@@ -18,8 +17,6 @@ from bag_factory import Drive, read_cloud  # noqa: E402
 from rosgraph_msgs.msg import Log  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 
-SHIFT_NS = 20 * 10**9  # between the stamps of two cases: a jump, so that each starts anew
-
 
 class Trouble(unittest.TestCase):
     """Messages are published by the test itself, as fast as they are taken, on the wall clock."""
@@ -32,13 +29,8 @@ class Trouble(unittest.TestCase):
         cls.folder = cls.context.__enter__()
         cls.drive = Drive(scans=2, points_per_scan=1600)
         cls.made = live.Made(cls.folder, cls.drive)
-        cls.messages = cls.made.messages()
         cls.expected = cls.made.fused()
-        types = {topic: type(message) for _, topic, message in cls.messages}
-        cls.publishers = {
-            topic: rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
-            for topic, kind in types.items()
-        }
+        cls.feed = live.Feed(cls.made)
         cls.semantic = live.Received("/points_semantic", PointCloud2)
         # Patient with a machine that is busy, and still far shorter than the test.
         overrides = ["%s.timeout=3" % key for key in ("cameras.front", "cameras.left", "odometry")]
@@ -47,9 +39,8 @@ class Trouble(unittest.TestCase):
             "fusion.launch", rig=cls.made.rig, bond="false", overrides=cls.overrides
         )
         cls.launch.__enter__()
-        live.wait_for_chain(types, rospy.get_name())
+        live.wait_for_chain(cls.feed.topics, rospy.get_name())
         cls.pid = live.pid_of(live.MANAGER)
-        cls.case = 0
 
     @classmethod
     def tearDownClass(cls):
@@ -59,36 +50,15 @@ class Trouble(unittest.TestCase):
     def tearDown(self):
         self.assertEqual(live.pid_of(live.MANAGER), self.pid, "the manager has died")
 
-    def shifted(self):
-        """The drive's messages at stamps that no other case has used: (topic, message)."""
-        type(self).case += 1
-        shift = rospy.Duration.from_sec(0)
-        shift.secs = self.case * SHIFT_NS // 10**9
-        result = []
-        for _, topic, original in self.messages:
-            message = copy.deepcopy(original)
-            for stamped in getattr(message, "transforms", [message]):
-                stamped.header.stamp += shift
-            result.append((topic, message))
-        return result
-
-    def publish(self, messages, change=None):
-        """Publishes; `change(topic, message)` gives what goes out instead, None for nothing."""
-        for topic, message in messages:
-            message = message if change is None else change(topic, message)
-            if message is not None:
-                self.publishers[topic].publish(message)
-                rospy.rostime.wallsleep(0.003)  # the pace of a drive; no step waits for it
-
     def run_drive(self, change=None, scans=2):
         self.semantic.clear()
-        self.publish(self.shifted(), change)
+        self.feed.publish(self.feed.next_drive(), change)
         return [read_cloud(m) for m in self.semantic.wait_for(scans)[:scans]]
 
     def assert_good(self):
         """An unchanged drive gives what fuse_bag gives."""
         self.semantic.clear()
-        self.publish(self.shifted())
+        self.feed.publish(self.feed.next_drive())
         received = self.semantic.wait_for(2)
         self.assertEqual(len(received), len(self.expected))
         for message, stamp in zip(received, sorted(self.expected)):

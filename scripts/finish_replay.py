@@ -1,0 +1,54 @@
+#!/usr/bin/python3
+# SPDX-License-Identifier: MIT
+"""Waits for the end of a replay and its last scans, says what came out and what was dropped, ends
+the recorder, and evaluates what it wrote. replay.launch starts it; its exit ends the launch."""
+
+import argparse
+import os
+import sys
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+
+from semantic_lidar_fusion import cli  # noqa: E402
+
+
+def make_parser():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rig", metavar="FILE", required=True, help="the rig file of the replay")
+    parser.add_argument(
+        "--overrides",
+        metavar="TEXT",
+        default="",
+        help="changes to the rig file, key=value, separated by blanks",
+    )
+    parser.add_argument(
+        "--recorded", metavar="BAG", default="", help="what the node `recorder` writes, if it runs"
+    )
+    parser.add_argument(
+        "--evaluate", metavar="DIR", help="write tables and plots of the recorded clouds there"
+    )
+    parser.add_argument("--bag", metavar="BAG", help="the bag that is played, with points_truth")
+    parser.add_argument(
+        "--player-within",
+        metavar="S",
+        type=float,
+        default=30.0,
+        help="seconds until the node `player` must run (default: 30)",
+    )
+    return parser
+
+
+def main():
+    parser = make_parser()
+    # roslaunch adds __name:=... and __log:=...
+    options = parser.parse_args([a for a in sys.argv[1:] if not a.startswith("__")])
+    if options.evaluate and not (options.bag and options.recorded):
+        parser.error("--evaluate needs --bag and --recorded")
+    cli.require("numpy", "yaml", "rospy", "rosgraph")
+    from semantic_lidar_fusion import replay
+
+    replay.finish(options)
+
+
+if __name__ == "__main__":
+    cli.run(main)
