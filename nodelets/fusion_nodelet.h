@@ -156,6 +156,8 @@ class FusionNodelet : public nodelet::Nodelet {
   /// The simulated clock and how long it has stood still, both in ns.
   std::pair<StampNs, StampNs> simulatedClock() const;
   void keepQueues();
+  /// Tells, latched, which version runs with which rig.
+  void publishConfiguration();
 
   /// A callback that runs while the nodelet is unloaded holds it until it returns, and the manager
   /// has destroyed the queues by then, into which timers and publishers reach as they end.
@@ -173,6 +175,7 @@ class FusionNodelet : public nodelet::Nodelet {
   Health::Clock::time_point started_ = Health::Clock::now();
   Health::Clock::time_point watched_ = started_;
   std::unique_ptr<diagnostic_updater::Updater> diagnostics_;
+  ros::Publisher configuration_;
   ros::WallTimer diagnostics_timer_, tick_timer_;
 };
 

@@ -376,10 +376,20 @@ class ReplayCase(unittest.TestCase):
             self.assertEqual(difference(message, offline), "")
 
     def assert_replay_gives(
-        self, expected, bag, rig, overrides, topics, rate=RATE, network=None, **arguments
+        self,
+        expected,
+        bag,
+        rig,
+        overrides,
+        topics,
+        rate=RATE,
+        network=None,
+        before_the_end=lambda: None,
+        **arguments,
     ):
         """Plays `bag` when all of `topics` have listeners and the external network, if there is
-        one, is connected. Returns the clouds that came."""
+        one, is connected. Returns the clouds that came. `before_the_end` is called before the
+        nodes end."""
         semantic = Received("/points_semantic", PointCloud2)
         try:
             with launched(
@@ -397,6 +407,7 @@ class ReplayCase(unittest.TestCase):
                     network.wait_until_connected()
                 resume()
                 received = semantic.wait_for(len(expected), timeout=60.0)
+                before_the_end()
         finally:
             semantic.close()
         self.assert_same(expected, received)
