@@ -468,6 +468,6 @@ class Said:
             lines = list(self._lines)
         return [line for line in lines if line[0] >= level and re.search(pattern, line[2])]
 
-    def wait_for(self, pattern, level=Log.WARN, timeout=20.0):
+    def wait_for(self, pattern, level=Log.WARN, timeout=60.0):
         with_text = lambda: "a line like '%s'; said: %s" % (pattern, self._lines)  # noqa: E731
         return wait_until(lambda: self.find(pattern, level), with_text, timeout)
