@@ -222,7 +222,7 @@ void writeLog(const std::string& path, std::int64_t resident_before, const Monit
   if (player != nullptr) {
     out << ",\n\"player\": {\"start\": " << player->startSteadyNs()
         << ", \"scans\": " << player->scanCount() << ", \"copies\": " << player->copyCount()
-        << ", \"thread_cpu_s\": " << player->threadCpuSeconds()
+        << ", \"copy_cpu_s\": " << player->copyCpuSeconds()
         << ", \"largest_lag_ns\": " << player->largestLagNs() << ", \"deliveries\": [";
     comma = "";
     for (const Delivery& delivery : player->deliveries()) {
