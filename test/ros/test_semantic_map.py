@@ -248,4 +248,4 @@ class SemanticMap(unittest.TestCase):
 
 if __name__ == "__main__":
     rospy.init_node("test_semantic_map")
-    rostest.rosrun("semantic_lidar_fusion", "semantic_map", SemanticMap)
+    rostest.rosrun("semantic_lidar_fusion", "live_map", SemanticMap)
