@@ -10,10 +10,9 @@
 #include <vector>
 
 #include "semantic_lidar_fusion/map/voxel_map.h"
-#if __has_include(<octomap/OccupancyOcTreeBase.h>)
+#ifdef SLF_BENCHMARK_OCTOMAP
 #include <octomap/OcTreeNode.h>
 #include <octomap/OccupancyOcTreeBase.h>
-#define SLF_BENCHMARK_OCTOMAP 1
 #endif
 
 namespace semantic_lidar_fusion {
