@@ -66,6 +66,7 @@ def main():
     os.environ["ROS_MASTER_URI"] = "http://127.0.0.1:%d" % options.port
     os.environ["ROS_IP"] = "127.0.0.1"
     import rospy
+    from diagnostic_msgs.msg import DiagnosticArray
     from sensor_msgs.msg import PointCloud2
     from std_msgs.msg import String
     from tf2_msgs.msg import TFMessage
@@ -82,6 +83,13 @@ def main():
         info.publish(json.dumps({"classes": tree["classes"]}))
         clouds = rospy.Publisher("points_semantic", PointCloud2, queue_size=20)
         tf = rospy.Publisher("/tf", TFMessage, queue_size=100)
+        values = {}
+
+        def on_diagnostics(message):
+            for status in message.status:
+                values.update({pair.key: pair.value for pair in status.values})
+
+        rospy.Subscriber("/diagnostics", DiagnosticArray, on_diagnostics)
         random = np.random.default_rng(1)
         scans = [street(labels, random) for _ in range(5)]
         while not (clouds.get_num_connections() and tf.get_num_connections()):
@@ -99,11 +107,16 @@ def main():
             clouds.publish(from_array(scans[number % 5], int(1e18 + seconds * 1e9), "velodyne"))
             time.sleep(max(0.0, start + (number + 1) / options.rate - time.monotonic()))
         wall = time.monotonic() - start
+        # What still waits counts, too.
+        while values.get("clouds mapped") != str(options.scans) and time.monotonic() < start + 300:
+            time.sleep(0.2)
         used = processor_s(node.pid) - before
         print(
             "%d scans of %d points in %.1f s: %.2f s of processor, %.1f ms a scan, %.3f of a core"
             % (options.scans, RINGS * COLUMNS, wall, used, 1e3 * used / options.scans, used / wall)
         )
+        for name in ("clouds mapped", "voxels", "map memory (MB)"):
+            print("%s: %s" % (name, values.get(name)))
     finally:
         for process in (node, master):
             process.send_signal(signal.SIGINT)
