@@ -26,10 +26,18 @@ the truth beside it. config/demo.yaml is its rig. The same options give the same
 
   /points_truth            x y z as measured, label, visible (bit i: the i-th camera sees the
                            point), surface (object), edge_px (distance to the nearest class edge,
-                           the least of all cameras that see it; -1: none), edge_px_<camera>;
+                           the least of all cameras that see it; -1: none), edge_px_<camera>,
+                           catchable (bit i: hidden from camera i by something that the lidar has
+                           measured within one ring and one azimuth step of the line of sight),
+                           silhouette (bit i: camera i sees the point, as near to something before
+                           it);
                            the decoder's points in their order, stamped with the first one's time
   /gmsl/*/labels_truth     class ids of the images that scans use
   /truth/poses             where the vehicle really is
+
+Scores imitate ENet at a stride of 8 full-size pixels, for the images that scans use: its borders,
+confusions, thin things and overconfidence, as measured on labelled CamVid photos by
+test/benchmark/network_errors.py. Compare: network_errors.py --bag BAG.
 
 options:
   --out BAG            the bag to write (required)
@@ -38,9 +46,12 @@ options:
   --seed N             another street, other noise (default 1)
   --scale F            image size, 0.1 to 1 times 1920 x 1208 (default 0.5)
   --width PIXELS       the same, by the images' width
-  --camera-drop M      cameras below the lidar, -1 to 1.2 (default 0.2)
+  --camera-drop M      cameras below the lidar, -1 to 1.2 (default 0.2); also --lidar-offset
   --image-rate HZ      1 to 100 (default 30)
   --images all|selected  also render images that no scan uses (default selected)
+  --image-choice closest_to_reference|closest_to_sweep
+                       as in the rig file: which images a scan uses, and truth is told for
+                       (default closest_to_reference)
   --raw                images as sensor_msgs/Image, not JPEG (set transport: raw in the rig)
   --static             nobody else moves
   --perfect-network    scores of the true class, at the images' resolution
@@ -119,6 +130,14 @@ SimulationOptions parseOptions(const std::vector<std::string>& arguments) {
         throw UsageError("--images is '" + which + "'; it must be all or selected");
       }
       options.all_images = which == "all";
+    } else if (name == "--image-choice") {
+      const std::string& choice = value();
+      if (choice != "closest_to_reference" && choice != "closest_to_sweep") {
+        throw UsageError("--image-choice is '" + choice +
+                         "'; it must be closest_to_reference or closest_to_sweep");
+      }
+      options.image_choice = choice == "closest_to_sweep" ? ImageChoice::kClosestToSweep
+                                                          : ImageChoice::kClosestToReference;
     } else if (name == "--raw") {
       options.raw_images = true;
     } else if (name == "--static") {
@@ -179,5 +198,6 @@ int main(int argc, char** argv) {
   action.sa_handler = semantic_lidar_fusion::simulator::rememberSignal;
   ::sigaction(SIGINT, &action, nullptr);
   ::sigaction(SIGTERM, &action, nullptr);
+  ::signal(SIGXFSZ, SIG_IGN);  // a file size limit is then an error of the write
   return semantic_lidar_fusion::simulator::run(std::vector<std::string>(argv + 1, argv + argc));
 }

@@ -14,6 +14,7 @@ DEFAULT_CLASSES = {
     "kitti": "config/classes_cityscapes.yaml",
     "semantickitti": "config/classes_semantickitti.yaml",
     "rellis": "config/classes_rellis.yaml",
+    "usyd": "config/classes_usyd12.yaml",
 }
 
 
@@ -69,8 +70,46 @@ def make_parser():
         help="published: the coefficients of the data set's own example (default: none, as in "
         "camera_info.txt, which fits better)",
     )
-    for command in (kitti, semantickitti, rellis):
-        command.add_argument("folder", metavar="DIR", help="the folder of the drive or sequence")
+    usyd = datasets.add_parser(
+        "usyd",
+        help="a bag of the USyd Campus data set",
+        description="A bag of the USyd Campus data set with its videos NAME-<camera>.h264 beside it: "
+        "the frames become images, stamped by the bag's frame_info messages; everything else "
+        "passes as it is.",
+    )
+    usyd.add_argument(
+        "--cameras",
+        type=_names,
+        metavar="NAME,...",
+        help="default: those of A0,A1,A2,B0,B1 that have a video",
+    )
+    usyd.add_argument(
+        "--time-correction",
+        type=float,
+        metavar="S",
+        help="what the images' stamps are too late by (default: what is known of the bag, else 0)",
+    )
+    usyd.add_argument(
+        "--start", type=_seconds, default=0.0, metavar="S", help="from the bag's begin (default: 0)"
+    )
+    usyd.add_argument(
+        "--duration", type=_seconds, metavar="S", help="of the part to import (default: all)"
+    )
+    usyd.add_argument(
+        "--first-frame",
+        type=_whole,
+        default=0,
+        metavar="N",
+        help="the frame_counter of the videos' first frame (default: 0)",
+    )
+    usyd.add_argument(
+        "--jpeg-quality", type=_quality, default=92, metavar="Q", help="1 to 100 (default: 92)"
+    )
+    for command in (kitti, semantickitti, rellis, usyd):
+        what = (
+            "the bag, or its folder" if command is usyd else "the folder of the drive or sequence"
+        )
+        command.add_argument("folder", metavar="BAG" if command is usyd else "DIR", help=what)
         command.add_argument("bag", metavar="OUT.bag", help="the bag to write")
         command.add_argument("--rig-out", metavar="FILE", help="rig file (default: OUT.yaml)")
         command.add_argument(
@@ -85,8 +124,12 @@ def make_parser():
             "--images",
             choices=["compressed", "raw"],
             default="compressed",
-            help="pass the image files on as they are, or decoded (default: compressed)",
+            help="JPEG, or decoded (default: compressed)"
+            if command is usyd
+            else "pass the image files on as they are, or decoded (default: compressed)",
         )
+        if command is usyd:
+            continue
         command.add_argument(
             "--first", type=_whole, default=0, metavar="N", help="first frame (default: 0)"
         )
@@ -104,6 +147,20 @@ def _whole(text):
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError("must not be negative")
+    return value
+
+
+def _seconds(text):
+    value = float(text)
+    if not 0 <= value < 1e9:
+        raise argparse.ArgumentTypeError("must not be negative")
+    return value
+
+
+def _quality(text):
+    value = int(text)
+    if not 1 <= value <= 100:
+        raise argparse.ArgumentTypeError("must be from 1 to 100")
     return value
 
 
@@ -135,17 +192,44 @@ def read_drive(options, labels):
     )
 
 
+def import_usyd(options, labels, rig_path):
+    """A bag of the USyd Campus data set, whose messages pass as they are."""
+    from semantic_lidar_fusion import dataset_usyd
+
+    summary = dataset_usyd.write(
+        options.folder,
+        options.bag,
+        rig_path,
+        labels,
+        dataset_usyd.Options(
+            cameras=options.cameras,
+            time_correction_s=options.time_correction,
+            start_s=options.start,
+            duration_s=options.duration,
+            first_frame=options.first_frame,
+            jpeg_quality=options.jpeg_quality if options.images == "compressed" else 0,
+            model=options.model,
+        ),
+    )
+    print("%s: %s" % (options.bag, dataset_usyd.describe(summary)))
+    dataset_usyd.warn_of_missing(summary)
+    print("%s: rig file" % rig_path)
+
+
 def main():
     parser = make_parser()
     options = parser.parse_args()
     if options.dataset is None:
-        parser.error("name a data set: kitti, semantickitti or rellis")
+        parser.error("name a data set: kitti, semantickitti, rellis or usyd")
     cli.require("numpy", "yaml", "rosbag", "sensor_msgs.msg", "tf2_msgs.msg")
     from semantic_lidar_fusion import dataset_writer
     from semantic_lidar_fusion.labels import LabelSet, package_file
 
     labels = LabelSet.from_file(options.classes or package_file(DEFAULT_CLASSES[options.dataset]))
     rig_path = options.rig_out or os.path.splitext(options.bag)[0] + ".yaml"
+    if options.dataset == "usyd":
+        cli.require("cv2")
+        return import_usyd(options, labels, rig_path)
     one_hot = getattr(options, "scores", "none") == "onehot"
     summary = dataset_writer.write(
         read_drive(options, labels),

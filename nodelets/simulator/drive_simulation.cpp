@@ -25,6 +25,7 @@
 #include "camera.h"
 #include "conversions.h"
 #include "drive_path.h"
+#include "fusion_chain.h"
 #include "lidar.h"
 #include "network.h"
 #include "noise.h"
@@ -34,6 +35,7 @@
 #include "semantic_lidar_fusion/lidar/packet_decoder.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 #include "street.h"
+#include "visibility.h"
 
 namespace semantic_lidar_fusion {
 namespace simulator {
@@ -52,8 +54,6 @@ constexpr double kSpeedScaleSigma = 0.005, kSpeedSigma = 0.03;    // of the spee
 constexpr double kYawBiasSigma = 8.7e-4, kYawRateSigma = 2.6e-3;  // rad/s
 constexpr double kTiltSigma = 5e-4;                               // rad
 constexpr int kJpegQuality = 92;
-/// A camera sees a point if its ray meets nothing this much before it: share of the range, and m.
-constexpr float kSeenShare = 1e-4F, kSeenM = 2e-3F;
 
 /// A bag that takes its name when it is whole.
 class Bag {
@@ -220,7 +220,7 @@ struct Scan {
   SimulatedScan simulated;
   TimedCloud cloud;  ///< as the package decodes it
   ScanInterval interval;
-  std::vector<std::uint16_t> visible;
+  std::vector<std::uint16_t> visible, catchable, silhouette;  ///< bit i: PointView of camera i
   std::vector<float> edge_px;  ///< point by point, the cameras in turn; negative: not seen
   StampNs record_ns = 0;
 };
@@ -279,6 +279,7 @@ class Simulation {
       }
       scan.interval = scanInterval(scan.cloud);
       scan.visible.assign(scan.cloud.size(), 0);
+      scan.catchable = scan.silhouette = scan.visible;
       scan.edge_px.assign(scan.cloud.size() * cameras_.size(), -1.0F);
       scans_.push_back(std::move(scan));
       checkpoint_();
@@ -298,6 +299,8 @@ class Simulation {
   void selectImages() {
     SelectorConfig config;
     config.cameras.resize(cameras_.size());
+    config.image_choice = options_.image_choice;
+    const bool sweeps = options_.image_choice == ImageChoice::kClosestToSweep;
     ScanSelector selector(config);
     std::map<StampNs, std::size_t> scan_of;
     std::size_t next_image = 0;
@@ -318,7 +321,15 @@ class Simulation {
     for (std::size_t i = 0; i < scans_.size(); ++i) {
       addImagesUntil(scans_[i].record_ns);
       scan_of[scans_[i].interval.first_ns] = i;
-      selector.addScan({scans_[i].interval, {}}, scans_[i].record_ns);
+      SelectorScan scan{scans_[i].interval, {}};
+      for (const MountedCamera& mounted : cameras_) {
+        if (!sweeps) break;
+        const Transform T_camera_lidar = mounted.camera.T_base_camera().inverse() * lidarPose();
+        scan.sweep_ns.push_back(
+            sweepTime(scans_[i].cloud,
+                      {std::make_shared<CameraModel>(mounted.camera.model()), T_camera_lidar}));
+      }
+      selector.addScan(scan, scans_[i].record_ns);
       take(selector.advance(scans_[i].record_ns));
     }
     addImagesUntil(images_.back());
@@ -425,6 +436,9 @@ class Simulation {
     for (const MountedCamera& mounted : cameras_) {
       addField("edge_px_" + mounted.name, offset, sensor_msgs::PointField::FLOAT32, 4);
     }
+    const std::uint32_t flags_at = offset;
+    addField("catchable", flags_at, sensor_msgs::PointField::UINT16, 2);
+    addField("silhouette", flags_at + 2, sensor_msgs::PointField::UINT16, 2);
     message.height = 1;
     message.width = static_cast<std::uint32_t>(scan.cloud.size());
     message.point_step = offset;
@@ -446,6 +460,8 @@ class Simulation {
       }
       std::memcpy(point + 20, &least, 4);
       std::memcpy(point + 24, edges, 4 * cameras_.size());
+      std::memcpy(point + flags_at, &scan.catchable[i], 2);
+      std::memcpy(point + flags_at + 2, &scan.silhouette[i], 2);
     }
     return message;
   }
@@ -511,19 +527,21 @@ class Simulation {
     const Camera& camera = cameras_[c].camera;
     const Transform T_world_camera = T_world_base * camera.T_base_camera();
     const Transform T_camera_world = T_world_camera.inverse();
+    const ReturnsAround returns(scan->simulated, path_, lidarPose(), kStartNs, time);
+    const auto mark = [c](std::uint16_t* bits, bool set) {
+      if (set) *bits = static_cast<std::uint16_t>(*bits | (1U << c));
+    };
     for (std::size_t i = 0; i < scan->simulated.echoes.size(); ++i) {
       const Echo& echo = scan->simulated.echoes[i];
       const Eigen::Vector3d p_world = world_.toWorld(echo.object, echo.p_object, time);
       const std::optional<Eigen::Vector2d> pixel = camera.model().project(T_camera_world * p_world);
       if (!pixel || !inImage(pixel->x(), pixel->y(), camera.model().imageSize())) continue;
-      const Eigen::Vector3d line = p_world - T_world_camera.translation();
-      const float range = static_cast<float>(line.norm());
-      const float before = range * (1.0F - kSeenShare) - kSeenM;
-      if (world_.blocked(T_world_camera.translation().cast<float>(),
-                         line.normalized().cast<float>(), 0.0F, before)) {
-        continue;
-      }
-      scan->visible[i] = static_cast<std::uint16_t>(scan->visible[i] | (1U << c));
+      const PointView view =
+          viewPoint(world_, returns, T_world_camera.translation(), echo.object, p_world);
+      mark(&scan->visible[i], view.visible);
+      mark(&scan->catchable[i], view.catchable);
+      mark(&scan->silhouette[i], view.silhouette);
+      if (!view.visible) continue;
       // Through a gap smaller than a pixel, the pixel's centre shows something else: an edge.
       const int u = pixelIndex(pixel->x()), v = pixelIndex(pixel->y());
       const bool shown = labels.at<std::uint8_t>(v, u) == static_cast<std::uint8_t>(echo.kind);

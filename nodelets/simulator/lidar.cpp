@@ -14,7 +14,6 @@ namespace simulator {
 namespace {
 
 constexpr double kPi = 3.14159265358979323846;
-constexpr double kTurnsPerS = 10.0;
 constexpr double kStartAzimuthRad = kPi;  // the seam is behind the vehicle
 constexpr double kMaxRangeM = 100.0;
 constexpr double kMinRangeM = 0.5;
@@ -32,7 +31,7 @@ void put16(Packet* packet, int at, unsigned value) {
 StampNs packetPeriodNs() { return firingTimes(LidarModel::kVlp16).packetNs(false); }
 
 int firstPacketOfScan(int index) {
-  return static_cast<int>(std::floor(index / kTurnsPerS / toSeconds(packetPeriodNs()) + 0.5));
+  return static_cast<int>(std::floor(index / kLidarTurnsPerS / toSeconds(packetPeriodNs()) + 0.5));
 }
 
 namespace {
@@ -42,7 +41,7 @@ void simulatePacket(const DrivePath& path, const LidarOptions& options, int numb
   const FiringTimes& times = firingTimes(LidarModel::kVlp16);
   const StampNs begin_ns = number * packetPeriodNs();  // since time 0
   const auto azimuthAt = [](StampNs ns) {
-    return kStartAzimuthRad + 2.0 * kPi * kTurnsPerS * toSeconds(ns);
+    return kStartAzimuthRad + 2.0 * kPi * kLidarTurnsPerS * toSeconds(ns);
   };
   packet->stamp = options.start_ns + begin_ns;
   for (int block = 0; block < kBlocksPerPacket; ++block) {

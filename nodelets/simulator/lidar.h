@@ -12,6 +12,8 @@
 namespace semantic_lidar_fusion {
 namespace simulator {
 
+constexpr double kLidarTurnsPerS = 10.0;
+
 struct LidarOptions {
   std::uint64_t seed = 1;
   StampNs start_ns = 0;  ///< stamp of time 0

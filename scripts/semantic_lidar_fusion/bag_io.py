@@ -9,7 +9,18 @@ read and written whether or not that package is installed.
 import os
 import struct
 from types import TracebackType
-from typing import Any, Dict, Iterable, Iterator, List, NamedTuple, Optional, Sequence, Type
+from typing import (
+    Any,
+    Dict,
+    Iterable,
+    Iterator,
+    List,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Tuple,
+    Type,
+)
 
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.errors import DataError
@@ -84,6 +95,10 @@ def message_class(type_name: str) -> Any:
     return _generated[type_name]
 
 
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
 def _absolute(topic: str) -> str:
     return topic if topic.startswith("/") else "/" + topic
 
@@ -94,6 +109,25 @@ class BagMessage(NamedTuple):
     topic: str
     message: Any
     stamp_ns: int
+
+
+class RawMessage(NamedTuple):
+    """A message as the bag holds it, of whatever type. `connection`: its connection header."""
+
+    topic: str
+    content: Tuple[Any, ...]
+    stamp_ns: int
+    connection: Dict[str, Any]
+
+    @property
+    def latched(self) -> bool:
+        return str(self.connection.get("latching", "0")) == "1"
+
+    def message(self) -> Any:
+        """Decoded by the definition that the bag brings along."""
+        message = self.content[-1]()
+        message.deserialize(self.content[1])
+        return message
 
 
 class BagReader:
@@ -163,6 +197,11 @@ class BagReader:
             self._counts.get(name, 0) for name in (self.topics if topics is None else topics)
         )
 
+    def stamps_ns(self, topic: str) -> List[int]:
+        """Record times (ns) of a topic's messages, in order, from the bag's index alone."""
+        connections = self._bag._get_connections([topic])
+        return sorted(to_ns(entry.time) for entry in self._bag._get_entries(connections))
+
     def read(
         self,
         topics: Optional[Sequence[str]] = None,
@@ -191,6 +230,22 @@ class BagReader:
         try:
             for topic, message, stamp in entries:
                 yield BagMessage(_absolute(topic), message, to_ns(stamp))
+        except (rosbag.ROSBagException, struct.error, OSError, EOFError) as error:
+            raise DataError("%s: damaged (%s)" % (self.path, error)) from error
+
+    def read_raw(self, label: Optional[str] = None) -> Iterator[RawMessage]:
+        """All messages in order of record time, not decoded; `label` as in read()."""
+        import rosbag
+
+        entries: Iterable[Any] = self._bag.read_messages(raw=True, return_connection_header=True)
+        if label is not None:
+            entries = cli.progress(entries, self.count(), label)
+        try:
+            for entry in entries:
+                header = {key: _text(value) for key, value in entry.connection_header.items()}
+                yield RawMessage(
+                    _absolute(entry.topic), entry.message, to_ns(entry.timestamp), header
+                )
         except (rosbag.ROSBagException, struct.error, OSError, EOFError) as error:
             raise DataError("%s: damaged (%s)" % (self.path, error)) from error
 
@@ -262,6 +317,19 @@ class BagWriter:
             }
         try:
             self._bag.write(topic, message, to_stamp(stamp_ns), connection_header=header)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def write_raw(self, item: RawMessage) -> None:
+        """Appends a message of another bag as it is."""
+        try:
+            self._bag.write(
+                item.topic,
+                item.content,
+                to_stamp(item.stamp_ns),
+                raw=True,
+                connection_header=dict(item.connection, topic=item.topic),
+            )
         except OSError as error:
             raise self._failed(error) from error
 

@@ -184,7 +184,7 @@ def _scan_loader(
     def load() -> records.Scan:
         xyz, intensity = records.read_points(path)
         times = records.sweep_times(xyz, start_ns, forward_ns, end_ns)
-        return records.Scan(xyz, intensity, records.rings_of_rows(xyz), times, None)
+        return records.Scan(xyz, intensity, records.rings_of_scan(xyz), times, None)
 
     return load
 
@@ -328,7 +328,7 @@ def _compact_loader(path: str) -> Callable[[], records.Scan]:
         times = records.sweep_times(xyz, 0, half, 2 * half)
         # As in the public files: 0 to 1.
         level = intensity.astype(np.float32) / (255.0 if intensity.dtype == np.uint8 else 1.0)
-        return records.Scan(xyz, level, records.rings_of_rows(xyz), times, None)
+        return records.Scan(xyz, level, records.rings_of_scan(xyz), times, None)
 
     return load
 

@@ -272,6 +272,30 @@ def rings_of_rows(xyz: np.ndarray) -> np.ndarray:
     return (row[-1] - row).astype(np.uint16)
 
 
+def rings_of_elevation(xyz: np.ndarray) -> np.ndarray:
+    """(N,) u16 ring, 0 = lowest, of the HDL-64E's laser that points nearest to each point's
+    elevation: 32 lasers 1/3 deg apart down from 2 deg, 32 lasers 1/2 deg apart below them."""
+    upper = 2.0 - np.arange(32) / 3.0
+    lower = upper[-1] - 0.5 * np.arange(1, 33)
+    lasers = np.concatenate([upper, lower])[::-1]
+    elevation = np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+    return np.searchsorted((lasers[1:] + lasers[:-1]) / 2.0, elevation).astype(np.uint16)
+
+
+def rings_of_scan(xyz: np.ndarray) -> np.ndarray:
+    """(N,) u16 ring, 0 = lowest, of a KITTI scan: by the order of its points where that is laser by
+    laser (exact), else by their elevation (some rings off, for the lasers differ in height)."""
+    rings = rings_of_rows(xyz)
+    rows = int(rings.max()) + 1 if len(rings) else 0
+    if len(xyz) < 32 * HDL64_RINGS:
+        return rings  # too few points to tell
+    elevation = np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+    spread = [np.ptp(np.percentile(elevation[rings == r], [10, 90])) for r in range(rows)]
+    # The lasers of real scans spread over up to 4.3 deg, for their height differs on the sensor.
+    by_laser = rows >= HDL64_RINGS // 4 and np.median(spread) < 8.0
+    return rings if by_laser else rings_of_elevation(xyz)
+
+
 def sweep_times(xyz: np.ndarray, start_ns: int, forward_ns: int, end_ns: int) -> np.ndarray:
     """(N,) u32 ns after start_ns at which a KITTI scan's points were measured.
 

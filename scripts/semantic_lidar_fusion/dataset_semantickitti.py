@@ -153,7 +153,7 @@ def _scan_loader(
         label = None
         if label_path is not None:
             label = records.map_ids(records.read_label_ids(label_path, len(xyz)), table)
-        return records.Scan(xyz, intensity, records.rings_of_rows(xyz), None, label)
+        return records.Scan(xyz, intensity, records.rings_of_scan(xyz), None, label)
 
     return load
 

@@ -130,7 +130,7 @@ def rig_tree(drive: records.Drive, rig_path: str, options: Options) -> Dict[str,
     return tree
 
 
-class _RigDumper(yaml.SafeDumper):
+class RigDumper(yaml.SafeDumper):
     """Short lists and mappings on one line, as the shipped files have them."""
 
 
@@ -138,13 +138,13 @@ def _is_flat(values: Any) -> bool:
     return all(not isinstance(value, (dict, list)) for value in values)
 
 
-_RigDumper.add_representer(
+RigDumper.add_representer(
     list,
     lambda dumper, data: dumper.represent_sequence(
         "tag:yaml.org,2002:seq", data, flow_style=_is_flat(data)
     ),
 )
-_RigDumper.add_representer(
+RigDumper.add_representer(
     dict,
     lambda dumper, data: dumper.represent_mapping(
         "tag:yaml.org,2002:map",
@@ -162,7 +162,7 @@ def rig_text(drive: records.Drive, rig_path: str, options: Options) -> str:
     lines = ["# Written by import_dataset.py. Every key is explained in config/usyd.yaml."]
     lines += ["# " + note for note in drive.notes]
     tree = rig_tree(drive, rig_path, options)
-    text = yaml.dump(tree, Dumper=_RigDumper, sort_keys=False, width=100, default_flow_style=False)
+    text = yaml.dump(tree, Dumper=RigDumper, sort_keys=False, width=100, default_flow_style=False)
     return "\n".join(lines) + "\n" + text
 
 

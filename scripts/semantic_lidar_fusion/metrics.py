@@ -45,6 +45,9 @@ class Confusion:
         cells = np.bincount(first * (rows + 1) + second, minlength=rows * (rows + 1))
         self.matrix += cells.reshape(rows, rows + 1)
 
+    def merge(self, other: "Confusion") -> None:
+        self.matrix += other.matrix
+
     @property
     def support(self) -> np.ndarray:
         """(R,) points of each true row."""
@@ -120,6 +123,13 @@ class Reliability:
         self.confidence_sum += np.bincount(place, weights=confidence, minlength=bins)
         self.right_count += np.bincount(place[predicted == truth], minlength=bins)
 
+    def merge(self, other: "Reliability") -> None:
+        self.count += other.count
+        self.confidence_sum += other.confidence_sum
+        self.right_count += other.right_count
+        self._log_loss += other._log_loss
+        self._brier += other._brier
+
     @property
     def total(self) -> int:
         return int(self.count.sum())
@@ -151,8 +161,8 @@ class Reliability:
 class Visibility:
     """What an occlusion mask does to the pairs of a point and a camera in whose image it lies.
 
-    Bit i of each (N,) integer array stands for camera i. Without a `catchable` truth its counts stay
-    None.
+    Bit i of each (N,) integer array stands for camera i. Of a truth that is not given there is no
+    row.
     """
 
     def __init__(self) -> None:
@@ -160,6 +170,8 @@ class Visibility:
         self.seen = self.seen_lost = 0
         self.catchable = self.catchable_caught = 0
         self.has_catchable = False
+        self.beside = self.beside_lost = 0
+        self.has_silhouette = False
 
     def add(
         self,
@@ -167,10 +179,12 @@ class Visibility:
         masked: np.ndarray,
         visible: np.ndarray,
         catchable: np.ndarray = None,
+        silhouette: np.ndarray = None,
     ) -> None:
         """unmasked, masked: cameras that contributed without and with the mask; visible: cameras
         that really see the point; catchable: hidden from the camera by something that the lidar
-        has measured beside the line of sight."""
+        has measured beside the line of sight; silhouette: something stands before the point within
+        one ring and one azimuth step of the line of sight."""
         lost = unmasked & ~masked
         hidden = unmasked & ~visible
         seen = unmasked & visible
@@ -182,6 +196,10 @@ class Visibility:
             self.has_catchable = True
             self.catchable += _bits(hidden & catchable)
             self.catchable_caught += _bits(hidden & catchable & lost)
+        if silhouette is not None:
+            self.has_silhouette = True
+            self.beside += _bits(seen & silhouette)
+            self.beside_lost += _bits(seen & silhouette & lost)
 
     def rows(self) -> List[list]:
         """[what, points, share] for a table."""
@@ -192,6 +210,13 @@ class Visibility:
             share = float(ratio(self.catchable_caught, self.catchable))
             result.append(["catchable hidden points caught", self.catchable, share])
         result.append(["visible points lost", self.seen, float(ratio(self.seen_lost, self.seen))])
+        if self.has_silhouette:
+            for name, count, gone in (
+                ("beside", self.beside, self.beside_lost),
+                ("off", self.seen - self.beside, self.seen_lost - self.beside_lost),
+            ):
+                share = float(ratio(gone, count))
+                result.append(["visible points lost %s silhouettes" % name, count, share])
         return result
 
 

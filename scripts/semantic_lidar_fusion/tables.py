@@ -104,18 +104,20 @@ _SUMMARY = (
 )
 
 
-def unmasked_of(scores: Sequence[Score]) -> Optional[Score]:
-    """The run against which the mask's removals are counted: the one before the last."""
-    return scores[-2] if len(scores) > 1 and "mask" in scores[-1].name else None
+def mask_pair(names: Sequence[str]) -> Optional[Tuple[int, int]]:
+    """The runs that differ in the mask alone: the last one named for it, and the one before."""
+    masked = [index for index, name in enumerate(names) if index and "mask" in name]
+    return (masked[-1] - 1, masked[-1]) if masked else None
 
 
 def _summary_rows(scores: Sequence[Score]) -> List[List[Any]]:
-    unmasked = unmasked_of(scores)
+    pair = mask_pair([score.name for score in scores])
     rows: List[List[Any]] = []
-    for score in scores:
+    for index, score in enumerate(scores):
         removed = float("nan")
-        if unmasked is not None and score is scores[-1]:
-            removed = float(ratio(unmasked.labelled - score.labelled, unmasked.labelled))
+        if pair is not None and index == pair[1]:
+            before = scores[pair[0]].labelled
+            removed = float(ratio(before - score.labelled, before))
         rows.append(
             [score.name, score.scans, score.points, score.labelled, removed]
             + [int(count) for count in score.status[1:]]
@@ -149,6 +151,33 @@ def visibility(rates: Visibility) -> str:
 
 def visibility_csv(rates: Visibility) -> str:
     return csv_text(["what", "points", "share"], rates.rows())
+
+
+def masks(results: Sequence[Tuple[str, str, Visibility]]) -> str:
+    """Rates of masks: (drive, mask, what it does) in rows."""
+    names = [row[0] for row in results[0][2].rows()]
+    rows = []
+    for drive, mask, rates in results:
+        cells = ["%s of %d" % (number(share, 4), points) for _, points, share in rates.rows()]
+        rows.append([drive, mask] + cells)
+    return markdown(["drive", "mask"] + names, rows)
+
+
+def masks_csv(results: Sequence[Tuple[str, str, Visibility]]) -> str:
+    rows = [[drive, mask] + row for drive, mask, rates in results for row in rates.rows()]
+    return csv_text(["drive", "mask", "what", "points", "share"], rows)
+
+
+def f1_by_drive(drives: Sequence[Tuple[str, Sequence[Score]]]) -> str:
+    """F1 of each class on each drive, from the first configuration to the last."""
+    shown = sorted({index for _, scores in drives for index in present_rows(scores)})
+    rows = []
+    for index in shown:
+        row = [title_of(drives[0][1][0].rows[index])]
+        for _, scores in drives:
+            row.append(", ".join(number(float(s.confusion.f1[index])) for s in scores))
+        rows.append(row)
+    return markdown(["F1"] + [name for name, _ in drives], rows)
 
 
 _TEMPERATURE = ["temperature", "exponent", "nll", "brier", "ece", "accuracy", "points"]

@@ -13,7 +13,7 @@
 
 #include "semantic_lidar_fusion/superpixel/slic.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
-#ifdef SLF_TEST_XIMGPROC
+#ifdef SLF_BENCHMARK_XIMGPROC
 #include <opencv2/ximgproc/seeds.hpp>
 #include <opencv2/ximgproc/slic.hpp>
 #endif
@@ -93,7 +93,7 @@ void BM_SlicWarm(benchmark::State& state) {
 
 void BM_SlicWarmOfFullImage(benchmark::State& state) { runSlic(state, {1920, 1208}, true); }
 
-#ifdef SLF_TEST_XIMGPROC
+#ifdef SLF_BENCHMARK_XIMGPROC
 void runOpenCv(benchmark::State& state, int algorithm) {
   const int width = static_cast<int>(state.range(0)), height = static_cast<int>(state.range(1));
   const int side = cvRound(std::sqrt(width * height / static_cast<double>(state.range(2))));
@@ -180,7 +180,7 @@ BENCHMARK(BM_SlicWarmOfFullImage)
     ->Args({640, 402, 1000})
     ->Args({960, 604, 1000})
     ->Unit(benchmark::kMillisecond);
-#ifdef SLF_TEST_XIMGPROC
+#ifdef SLF_BENCHMARK_XIMGPROC
 BENCHMARK(BM_OpenCvSlic)->Apply(sizes);
 BENCHMARK(BM_OpenCvSlico)->Apply(sizes);
 BENCHMARK(BM_OpenCvSeeds)->Apply(sizes);

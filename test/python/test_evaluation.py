@@ -215,6 +215,40 @@ def test_motion_correction_shows_in_the_table(run_command, tmp_path):
 
 
 @needs_program
+def test_live_clouds_stand_beside_those_of_fuse_bag(run_command, tmp_path):
+    drive = Drive(scans=3, speed=5.0)
+    bag, path = tmp_path / "in.bag", tmp_path / "rig.yaml"
+    bag_factory.write_bag(str(bag), drive)
+    add_truth(bag, drive)
+    path.write_text(bag_factory.rig_text(drive))
+    arguments = ["evaluate.py", bag, "--rig", path, "--out", tmp_path / "out"]
+    code, _, err = run_command(*(arguments + ["--keep-bags"]))
+    assert code == 0, err
+    # Two of the three scans came out live, one of them with another label.
+    live = tmp_path / "live.bag"
+    with rosbag.Bag(str(tmp_path / "out" / "motion_mask.bag")) as source, BagWriter(
+        str(live), "none"
+    ) as target:
+        clouds = 0
+        for topic, message, stamp in source.read_messages(["/points_semantic", "/scan_reference"]):
+            if topic == "/points_semantic":
+                clouds += 1
+                if clouds == 2:
+                    continue
+                if clouds == 3:
+                    message.data = bytes(message.data[:-1]) + bytes([message.data[-1] ^ 1])
+            target.write(topic, message, stamp.to_nsec())
+    code, text, err = run_command(*(arguments + ["--live", live, "--force"]))
+    assert code == 0, err
+    assert "2 of 3 scans came out live; 1 of them equal those of motion_mask" in text
+    counts = table(tmp_path / "out", "summary.csv")
+    assert [row["configuration"] for row in counts] == ["direct", "motion", "motion_mask", "live"]
+    assert [row["scans"] for row in counts] == ["3", "3", "3", "2"]
+    # The mask's share is that of the column made with it.
+    assert counts[2]["removed_by_mask"] != "" and counts[3]["removed_by_mask"] == ""
+
+
+@needs_program
 def test_a_failing_fuse_bag_is_reported(rig, run_command, tmp_path):
     known = write(tmp_path / "t.bag", "/points_truth", truth_cloud(bytes_of(0)))
     code, _, err = run_command("evaluate.py", known, "--rig", rig, "--out", tmp_path / "out")
@@ -257,6 +291,7 @@ def test_another_order_of_points_is_refused(rig, run_command, tmp_path):
         (("a.bag", "--rig", "r", "--fit-on", "b.bag"), "--fit-on needs"),
         (("a.bag", "--clouds", "x"), "must be NAME=BAG"),
         (("--images", "d", "--model", "m"), "--images needs --classes"),
+        (("--images", "d", "--live", "l"), "--images needs --model"),
     ],
 )
 def test_options_that_do_not_fit_together(run_command, arguments, message):

@@ -227,6 +227,28 @@ def test_rings_keep_the_largest_falls():
     assert len(dataset_records.rings_of_rows(np.zeros((0, 3)))) == 0
 
 
+def test_rings_of_scans_that_are_not_laser_by_laser():
+    # 64 lasers of the HDL-64E at 10 m, 90 azimuths; seen by the sensor's order, shuffled, by columns.
+    lasers = np.radians(np.concatenate([2.0 - np.arange(32) / 3, -8.83 - 0.5 * np.arange(32)]))
+    elevation = np.repeat(lasers, 90)
+    azimuth = np.tile(np.radians(np.arange(90) * 4.0 + 1.0), 64)
+    xyz = 10 * np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        axis=1,
+    )
+    truth = 63 - np.repeat(np.arange(64), 90)
+    for order in (
+        np.arange(len(xyz)),
+        np.random.RandomState(1).permutation(len(xyz)),
+        np.arange(len(xyz)).reshape(64, 90).T.reshape(-1),
+    ):
+        assert (dataset_records.rings_of_scan(xyz[order]) == truth[order]).all()
+
+
 def test_overflowed_coordinates_return_to_their_place():
     angles = np.radians(np.arange(1.0, 359.0, 0.2))
     distance = np.where((np.arange(len(angles)) % 37) < 3, 80.0, 20.0)

@@ -232,6 +232,15 @@ def test_visibility_by_hand():
     visibility.add(unmasked, masked, visible, catchable)
     assert visibility.rows()[1] == ["catchable hidden points caught", 1, 1.0]
     assert visibility.hidden == 4 and visibility.seen_lost == 2
+    # The point whose bit 3 is lost stands beside a silhouette of camera 3, and another not in view.
+    silhouette = np.array([0b0000, 0b0000, 0b1000, 0b0001], dtype=np.uint16)
+    beside = Visibility()
+    beside.add(unmasked, masked, visible, silhouette=silhouette)
+    assert beside.rows()[1:] == [
+        ["visible points lost", 2, 0.5],
+        ["visible points lost beside silhouettes", 1, 1.0],
+        ["visible points lost off silhouettes", 1, 0.0],
+    ]
 
 
 def test_visibility_counts_the_highest_camera():

@@ -209,6 +209,20 @@ def test_edge_distance_is_that_of_the_label_image(exact_bag):
     assert 0.3 < seen.any(axis=1).mean() < 1.0
 
 
+def test_hidden_points_are_catchable_beside_their_occluder(exact_bag):
+    truth = np.concatenate([cloud_io.to_array(m) for m in read(exact_bag, "/points_truth")])
+    visible, catchable, silhouette = (
+        np.stack([truth[name] >> i & 1 for i in range(5)], axis=1).astype(bool)
+        for name in ("visible", "catchable", "silhouette")
+    )
+    assert not (catchable & visible).any()
+    assert not (silhouette & ~visible).any()
+    # Most of what hides a point from a camera 0.6 m away is measured there, but not all of it.
+    assert catchable.sum() > 100
+    # Silhouettes are few, yet a point in front of nothing is not the rule in a street.
+    assert 0.01 < silhouette.sum() / visible.sum() < 0.5
+
+
 def test_every_class_occurs(noisy_bag):
     labels = np.concatenate(
         [cloud_io.to_array(m)["label"] for m in read(noisy_bag, "/points_truth")]
@@ -286,6 +300,7 @@ def test_wrong_command_lines_are_named(tmp_path):
         (["--speed", "50"], ["--speed", "'50'", "5 to 15"]),
         (["--duration", "x"], ["--duration", "'x'"]),
         (["--images", "some"], ["--images", "'some'"]),
+        (["--image-choice", "best"], ["--image-choice", "'best'", "closest_to_sweep"]),
         (["--nonsense"], ["--nonsense"]),
         (["--seed"], ["--seed", "value"]),
     ):

@@ -85,7 +85,9 @@ def _stop(process, timeout=20.0):
 
 @contextlib.contextmanager
 def launched(name, **arguments):
-    """A launch file of the package as long as the block runs."""
+    """A launch file of the package as long as the block runs; a sanitizer reaches its manager."""
+    if os.environ.get("SLF_LAUNCH_PREFIX"):
+        arguments.setdefault("launch_prefix", os.environ["SLF_LAUNCH_PREFIX"])
     command = ["roslaunch", "--skip-log-check", os.path.join(SOURCE_DIR, "launch", name)]
     command += ["%s:=%s" % item for item in arguments.items()]
     process = subprocess.Popen(command)

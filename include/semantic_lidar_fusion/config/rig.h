@@ -117,6 +117,7 @@ struct Rig {
   OcclusionConfig occlusion;
   OverlapRule overlap = OverlapRule::kMean;
   bool keep_unlabelled = true;
+  int threads = 1;  ///< that share the cameras of a scan; results do not depend on it
 
   /// Index of the reference camera; -1 without cameras.
   int referenceCamera() const;

@@ -1,0 +1,41 @@
+// SPDX-License-Identifier: MIT
+/// The lidar's own range image: the steps between its beams, and which neighbouring returns lie on
+/// one surface.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "semantic_lidar_fusion/common/point_cloud.h"
+#include "semantic_lidar_fusion/projection/occlusion_config.h"
+
+namespace semantic_lidar_fusion {
+
+/// What the lidar's own range image says of each beam; independent of the camera.
+struct BeamGrid {
+  struct Ring {
+    double elevation_rad = 0;  ///< median
+    double half_up_rad = 0;    ///< half-way to the next ring up
+    double half_down_rad = 0;
+    double half_azimuth_rad = 0;  ///< half the median azimuth step
+  };
+  /// Cloud indices of the neighbouring returns on the same surface; kNoLink = the surface ends.
+  struct Links {
+    std::int32_t left, right, up, down;
+  };
+  static constexpr std::int32_t kNoLink = -1;
+
+  std::vector<Ring> rings;       ///< by ring number; of rings without points all zero
+  double vertical_step_rad = 0;  ///< median over rings
+  double horizontal_step_rad = 0;
+  /// Adaptive only, by cloud index: the ring (a made-up one if the cloud has none; kNoRing for
+  /// points that cast no mask) and the links.
+  std::vector<std::uint16_t> ring;
+  std::vector<Links> links;
+};
+
+/// Steps given in `config` override the data. Throws DataError when the vertical step is needed and
+/// neither the cloud (no ring field) nor `config` gives it.
+BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config);
+
+}  // namespace semantic_lidar_fusion

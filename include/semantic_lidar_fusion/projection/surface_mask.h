@@ -1,0 +1,33 @@
+// SPDX-License-Identifier: MIT
+/// `adaptive`: the mask of a point is the piece of surface that its beam stands for, as the camera
+/// sees it, and its depth follows the surface. Towards a neighbouring return (next ring up or down,
+/// next firing left or right) on the same surface it reaches half-way, with inverse depth linear
+/// in between. Towards a neighbour on another surface, or none, the surface ends somewhere between
+/// the two beams: the mask reaches three quarters of the way, straight on from the neighbour on the
+/// opposite side, or else at the point's range; half of the way up and down if it has a neighbour
+/// on its surface neither above nor below, and to all sides if it has none at all. Two returns lie
+/// on one surface if their ranges are close, or (ground at a grazing angle) if the surface goes on
+/// straight. A point is hidden iff d > d_near + max(depth_margin_m, depth_margin_ratio * d_near),
+/// d_near = the nearest mask on its pixel. So ground does not hide itself, however far the camera
+/// is from the lidar. All points cast, also from outside the image; where masks are tall they are
+/// sampled every few pixels along their height.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "semantic_lidar_fusion/camera/camera_model.h"
+#include "semantic_lidar_fusion/common/point_cloud.h"
+#include "semantic_lidar_fusion/projection/beam_grid.h"
+#include "semantic_lidar_fusion/projection/cloud_projector.h"
+
+namespace semantic_lidar_fusion {
+
+/// 1 = visible, 0 = hidden, for each of `points`. Meaningless for points outside the image. `grid`
+/// is that of `cloud` in mode adaptive.
+std::vector<std::uint8_t> visibleBySurfaces(const Cloud& cloud, const ProjectedPoints& points,
+                                            const Transform& T_camera_lidar,
+                                            const CameraModel& camera, const BeamGrid& grid,
+                                            const OcclusionConfig& config);
+
+}  // namespace semantic_lidar_fusion
