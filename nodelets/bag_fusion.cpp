@@ -54,7 +54,7 @@ BagFusion::BagFusion(const FuseBagOptions& options, void (*checkpoint)())
       rig_(loadRig(options.rig, options.overrides)),
       chain_(rig_),
       lidar_(rig_.lidar,
-             [this](const std::string& reason, std::uint64_t n, LidarDecoder::Discarded) {
+             [this](const std::string& reason, std::uint64_t n) {
                if (counts_points_) drops_.add("lidar: " + reason, n);
              }),
       input_(options.input),

@@ -53,8 +53,7 @@ class ImageSelectionNodelet : public FusionNodelet {
   void initialize() override {
     selector_ = std::make_unique<ScanSelector>(rig().selectorConfig());
     // The motion nodelet decodes the same messages, and counts.
-    lidar_ = std::make_unique<LidarDecoder>(
-        rig().lidar, [](const std::string&, std::uint64_t, LidarDecoder::Discarded) {});
+    lidar_ = std::make_unique<LidarDecoder>(rig().lidar, [](const std::string&, std::uint64_t) {});
     sweep_ = rig().image_choice == ImageChoice::kClosestToSweep;
     if (sweep_) tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
     reference_ = advertise<sensor_msgs::TimeReference>(getNodeHandle(), "scan_reference", 16);

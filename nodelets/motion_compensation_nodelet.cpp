@@ -47,8 +47,11 @@ class MotionCompensationNodelet : public FusionNodelet {
 
   void initialize() override {
     lidar_ = std::make_unique<LidarDecoder>(
-        rig().lidar, [this](const std::string& reason, std::uint64_t count,
-                            LidarDecoder::Discarded kind) { onDiscarded(reason, count, kind); });
+        rig().lidar,
+        [this](const std::string& reason, std::uint64_t count) { onDropped(reason, count); },
+        [this](const std::string& reason, std::uint64_t count) {
+          health().count("left out: " + reason, count);
+        });
     // The selection nodelet settles t_ref within its own timeout; the rest is grace for its thread.
     longest_reference_wait_ns_ = toNs(rig().reference.timeout_s) + kReferenceGraceNs;
     tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
@@ -99,12 +102,8 @@ class MotionCompensationNodelet : public FusionNodelet {
     release();
   }
 
-  void onDiscarded(const std::string& reason, std::uint64_t count, LidarDecoder::Discarded kind) {
+  void onDropped(const std::string& reason, std::uint64_t count) {
     if (count == 0) return;
-    if (kind == LidarDecoder::Discarded::kAsIntended) {
-      health().count("left out: " + reason, count);
-      return;
-    }
     health().count("dropped: " + reason, count);
     const std::string topic = getNodeHandle().resolveName(rig().lidar.topic);
     warn("lidar " + reason, topic + ": " + std::to_string(count) + " " + reason +

@@ -41,10 +41,9 @@ TEST(WithVelodyneMsgs, ScansAreDecoded) {
     std::copy(packet.data.begin(), packet.data.end(), message.data.begin());
     scan.packets.push_back(message);
   }
-  LidarDecoder decoder(LidarConfig(),
-                       [](const std::string& reason, std::uint64_t count, LidarDecoder::Discarded) {
-                         EXPECT_EQ(count, 0u) << "dropped: " << reason;
-                       });
+  LidarDecoder decoder(LidarConfig(), [](const std::string& reason, std::uint64_t count) {
+    EXPECT_EQ(count, 0u) << "dropped: " << reason;
+  });
   const TimedCloud cloud = decoder.decode(scan);
   EXPECT_EQ(cloud.frame_id, "velodyne");
   EXPECT_EQ(cloud.size(), 5u * 384u);
