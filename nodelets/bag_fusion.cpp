@@ -54,7 +54,7 @@ BagFusion::BagFusion(const FuseBagOptions& options, void (*checkpoint)())
       rig_(loadRig(options.rig, options.overrides)),
       chain_(rig_),
       lidar_(rig_.lidar,
-             [this](const std::string& reason, std::uint64_t n) {
+             [this](const std::string& reason, std::uint64_t n, LidarDecoder::Discarded) {
                if (counts_points_) drops_.add("lidar: " + reason, n);
              }),
       input_(options.input),
@@ -245,7 +245,7 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
       ++state.none;
     }
   }
-  const FusionResult result = chain_.fused(rigid.cloud, views);
+  const FusionResult result = chain_.fused(rigid.cloud, views, options_.all);
   const auto compensated = compensatedCloudMessage(rigid.cloud);
   const auto semantic = semanticCloudMessage(result.cloud, rig_.classes);
 
@@ -349,6 +349,9 @@ std::shared_ptr<const SegmentedImage> BagFusion::segmentedImage(std::size_t came
     const std::shared_ptr<SegmentedImage> image = loadImage(camera, stamp);
     checkSize(*image, place.model->imageSize());
     chain_.segment(camera, image.get());
+    if (!image->note.empty() && told_notes_.insert(image->note).second && !options_.quiet) {
+      DropLog::note(image->note);
+    }
     if (options_.all) writeImageProducts(camera, *image, output);
     state.recent.push_back(image);
     if (state.recent.size() > kRecentImages) state.recent.pop_front();
@@ -455,6 +458,7 @@ std::string BagFusion::summary() const {
             count(index_.cameras[c].images.size(), "image") + " and " +
             std::to_string(index_.cameras[c].semantics.size()) + " of scores in the bag\n";
   }
+  if (!lidar_.timeDecision().empty()) text += "  " + lidar_.timeDecision() + "\n";
   if (drops_.counts().empty()) text += "  nothing was dropped\n";
   for (const auto& drop : drops_.counts()) {
     text += "  counted: " + drop.first + ": " + std::to_string(drop.second) + "\n";

@@ -10,6 +10,7 @@
 #include <map>
 #include <memory>
 #include <optional>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -92,6 +93,7 @@ class BagFusion {
   DriveIndex index_;
   std::vector<Scan> scans_;
   std::vector<CameraState> cameras_;
+  std::set<std::string> told_notes_;
   std::map<std::pair<std::string, std::string>, std::optional<Transform>> extrinsics_;
   PointCounters points_;
   std::uint64_t scans_written_ = 0;

@@ -2,21 +2,47 @@
 #include "bag_output.h"
 
 #include <fcntl.h>
+#include <rosbag/view.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstdio>
 #include <cstring>
 
 namespace semantic_lidar_fusion {
+namespace {
+
+/// Whether a file holds nothing that cannot be made again: an empty one, or this program's output.
+bool isReplaceable(const std::string& path, off_t size) {
+  if (size == 0) return true;
+  try {
+    rosbag::Bag bag(path, rosbag::bagmode::Read);
+    rosbag::View view(bag);
+    const auto connections = view.getConnections();
+    return !connections.empty() && std::all_of(connections.begin(), connections.end(),
+                                               [](const rosbag::ConnectionInfo* connection) {
+                                                 const auto caller =
+                                                     connection->header->find("callerid");
+                                                 return caller != connection->header->end() &&
+                                                        caller->second == BagOutput::kCaller;
+                                               });
+  } catch (const std::exception&) {
+    return false;  // not a bag
+  }
+}
+
+}  // namespace
 
 BagOutput::BagOutput(const std::string& path, bool overwrite)
     : path_(path), written_path_(path + ".tmp") {
   struct stat status {};
   if (::stat(path.c_str(), &status) == 0) {
     if (!S_ISREG(status.st_mode)) throw Error(path + ": exists and is not a file");
-    if (!overwrite) throw Error(path + ": exists; give --force to replace it");
+    if (!overwrite && !isReplaceable(path, status.st_size)) {
+      throw Error(path + ": exists and is not from fuse_bag; give --force to replace it");
+    }
   }
   bag_ = std::make_unique<rosbag::Bag>();
   try {

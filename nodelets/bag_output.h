@@ -15,8 +15,10 @@ namespace semantic_lidar_fusion {
 
 class BagOutput {
  public:
-  /// Writes to `<path>.tmp` until commit. Throws Error if `path` exists and `overwrite` is false,
-  /// or if the file cannot be made.
+  static constexpr const char* kCaller = "/fuse_bag";  ///< `callerid` of all that it writes
+
+  /// Writes to `<path>.tmp` until commit. Throws Error if the file cannot be made, or if `path`
+  /// exists, `overwrite` is false, and it is neither empty nor an earlier output.
   BagOutput(const std::string& path, bool overwrite);
   /// Removes what was written unless committed.
   ~BagOutput();
@@ -48,7 +50,7 @@ class BagOutput {
     (*header)["type"] = ros::message_traits::datatype(message);
     (*header)["md5sum"] = ros::message_traits::md5sum(message);
     (*header)["message_definition"] = ros::message_traits::definition(message);
-    (*header)["callerid"] = "/fuse_bag";
+    (*header)["callerid"] = kCaller;
     (*header)["latching"] = latched ? "1" : "0";
     return header;
   }

@@ -76,6 +76,9 @@ cv::Mat eightBitImage(cv::Mat image) {
   return image;
 }
 
+/// Largest time between a compensated point and its cloud's stamp.
+constexpr float kMaxDt_s = 86400.0f;
+
 struct FieldLayout {
   const char* name;
   std::uint8_t datatype;
@@ -373,12 +376,14 @@ Cloud compensatedCloud(const sensor_msgs::PointCloud2& message) {
   Cloud cloud;
   cloud.frame_id = frameName(message.header.frame_id);
   cloud.stamp = stampNs(message.header.stamp);
-  cloud.resize(static_cast<std::size_t>(message.width) * message.height);
+  const bool has_points = message.width > 0 && message.height > 0;
   for (const char* name : {"x", "y", "z"}) {
-    if (!findField(message, {name, PointField::FLOAT32}) && !cloud.empty()) {
+    // Before memory is taken: with a point_step of 0 any number of points fits no data at all.
+    if (has_points && !findField(message, {name, PointField::FLOAT32})) {
       throw DataError(std::string("cloud has no field '") + name + "'");
     }
   }
+  cloud.resize(static_cast<std::size_t>(message.width) * message.height);
   std::fill(cloud.intensity.begin(), cloud.intensity.end(), 0.0f);
   std::fill(cloud.ring.begin(), cloud.ring.end(), kNoRing);
   std::fill(cloud.dt.begin(), cloud.dt.end(), 0.0f);
@@ -392,10 +397,19 @@ Cloud compensatedCloud(const sensor_msgs::PointCloud2& message) {
   readField(message, {"dt", PointField::FLOAT32}, &cloud.dt);
   readField(message, {"status", PointField::UINT8}, &cloud.status);
   for (std::size_t i = 0; i < cloud.size(); ++i) {
-    if (!std::isfinite(cloud.x[i]) || !std::isfinite(cloud.y[i]) || !std::isfinite(cloud.z[i]) ||
-        !std::isfinite(cloud.dt[i])) {
+    if (!std::isfinite(cloud.x[i]) || !std::isfinite(cloud.y[i]) || !std::isfinite(cloud.z[i])) {
       throw DataError("cloud point " + std::to_string(i) + " is not finite");
     }
+    if (!(std::abs(cloud.dt[i]) <= kMaxDt_s)) {
+      throw DataError("cloud point " + std::to_string(i) + " has dt " +
+                      std::to_string(cloud.dt[i]) + " s; a day at most is wanted");
+    }
+    if (cloud.status[i] != static_cast<std::uint8_t>(PointStatus::kFused) &&
+        cloud.status[i] != static_cast<std::uint8_t>(PointStatus::kNoOdometry)) {
+      throw DataError("cloud point " + std::to_string(i) + " has status " +
+                      std::to_string(cloud.status[i]) + "; 0 or 4 is wanted");
+    }
+    if (!std::isfinite(cloud.intensity[i])) cloud.intensity[i] = 0.0f;
   }
   const auto least_dt = std::min_element(cloud.dt.begin(), cloud.dt.end());
   cloud.first_point_ns =

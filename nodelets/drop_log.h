@@ -25,6 +25,9 @@ class DropLog {
   static void warn(const std::string& text) {
     std::fprintf(stderr, "fuse_bag: warning: %s\n", text.c_str());
   }
+  static void note(const std::string& text) {
+    std::fprintf(stderr, "fuse_bag: note: %s\n", text.c_str());
+  }
   const std::map<std::string, std::uint64_t>& counts() const { return counts_; }
 
  private:

@@ -19,7 +19,7 @@ options:
   --all            also write for each camera superpixels, share, probabilities, scores (where the
                    package's own network made them), projection_overlay and uncertainty_overlay
   --tf             also copy /tf and /tf_static to OUT.bag
-  --force          replace OUT.bag if it exists
+  --force          replace OUT.bag whatever it is; without, an earlier output only
   --quiet          no progress and no summary
   --help           this text
 

@@ -48,6 +48,7 @@ FusionConfig fusionConfig(const Rig& rig) {
   config.occlusion = rig.occlusion;
   config.overlap = rig.overlap;
   config.keep_unlabelled = rig.keep_unlabelled;
+  config.threads = rig.threads;
   return config;
 }
 
@@ -96,8 +97,9 @@ void FusionChain::segment(std::size_t index, SegmentedImage* image) {
   }
   camera.semantics.noteScores(image->input);
   const ImageSize pixels{image->image.cols, image->image.rows};
-  const SuperpixelMap superpixels = camera.semantics.cluster(
-      image->image, camera.semantics.mapSize(pixels).value_or(pixels), image->stamp);
+  const ImageSize map_size = camera.semantics.mapSize(pixels).value_or(pixels);
+  image->note = camera.semantics.clampNote(map_size);
+  const SuperpixelMap superpixels = camera.semantics.cluster(image->image, map_size, image->stamp);
   image->superpixel_ids = superpixels.ids;
   if (camera.config.input == CameraInput::kLabels) {
     image->semantics.probabilities =
@@ -148,9 +150,10 @@ CameraView FusionChain::view(std::size_t index, const CameraPlace& place,
   return view;
 }
 
-FusionResult FusionChain::fused(const Cloud& cloud, std::vector<CameraView> views) const {
+FusionResult FusionChain::fused(const Cloud& cloud, std::vector<CameraView> views,
+                                bool with_pixels) const {
   if (!projector_) return unclassified(cloud, rig_.keep_unlabelled);
-  return projector_->fuse(cloud, std::move(views));
+  return projector_->fuse(cloud, std::move(views), with_pixels);
 }
 
 Cloud FusionChain::emptyCloud(const TimedCloud& scan) const {

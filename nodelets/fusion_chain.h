@@ -33,6 +33,7 @@ struct SegmentedImage {
   cv::Mat share;                      ///< scores only
   ImageSemantics semantics;           ///< what the projection reads
   bool from_network = false;          ///< `input` was made by the package's own network
+  std::string note;                   ///< what to tell a user of its superpixels; mostly empty
 };
 
 /// Where one camera stands in one scan.
@@ -64,7 +65,8 @@ class FusionChain {
                   StampNs reference_ns, const PoseBuffer& odometry,
                   const std::optional<Transform>& T_vehicle_lidar) const;
 
-  FusionResult fused(const Cloud& cloud, std::vector<CameraView> views) const;
+  /// `with_pixels`: also where the points went in each camera, for overlays.
+  FusionResult fused(const Cloud& cloud, std::vector<CameraView> views, bool with_pixels) const;
 
   /// A cloud without points, as an empty scan gives it.
   Cloud emptyCloud(const TimedCloud& scan) const;

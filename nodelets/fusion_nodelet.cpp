@@ -3,6 +3,7 @@
 
 #include <nodelet/detail/callback_queue.h>
 #include <ros/master.h>
+#include <std_msgs/String.h>
 
 #include <algorithm>
 #include <string>
@@ -22,6 +23,10 @@ constexpr std::chrono::seconds kSilence{5};
 constexpr auto kEver = std::chrono::duration<double>::max();
 /// A clock that stands still for longer is taken for the end of a bag.
 constexpr StampNs kClockStall = 3 * kNsPerSecond;
+
+const char* const kSilentClock = "use_sim_time is true but /clock is silent; play with --clock";
+
+bool clockIsSilent() { return ros::Time::isSimTime() && ros::Time::now().isZero(); }
 
 /// Number of single-letter edits that make b of a (Levenshtein).
 std::size_t editDistance(const std::string& a, const std::string& b) {
@@ -83,12 +88,19 @@ void FusionNodelet::keepQueues() {
 void FusionNodelet::onInit() {
   keepQueues();
   try {
+    for (const std::string& problem : unknownParameters(getPrivateNodeHandle())) {
+      NODELET_WARN_STREAM(problem);
+    }
     rig_ = loadRigFromParameters(getPrivateNodeHandle());
+    publishConfiguration();
     diagnostics_ = std::make_unique<diagnostic_updater::Updater>(getNodeHandle(),
                                                                  getPrivateNodeHandle(), getName());
     diagnostics_->setHardwareID(rig_.name.empty() ? "none" : rig_.name);
     diagnostics_->add("fusion", [this](diagnostic_updater::DiagnosticStatusWrapper& status) {
       health_.fill(status);
+      if (clockIsSilent()) {
+        status.mergeSummary(diagnostic_msgs::DiagnosticStatus::STALE, kSilentClock);
+      }
     });
     {
       // Listeners may connect while publishers are still being set up.
@@ -107,6 +119,14 @@ void FusionNodelet::onInit() {
   } catch (const std::exception& problem) {
     NODELET_FATAL_STREAM("cannot start: " << problem.what());
   }
+}
+
+void FusionNodelet::publishConfiguration() {
+  const auto message = boost::make_shared<std_msgs::String>();
+  message->data = "version: " SLF_VERSION "\n" + rig_.yaml + "\n";
+  configuration_ = getPrivateNodeHandle().advertise<std_msgs::String>("configuration", 1, true);
+  configuration_.publish(message);
+  health_.set("version", SLF_VERSION);
 }
 
 void FusionNodelet::startTicking() {
@@ -145,6 +165,13 @@ void FusionNodelet::guard(const std::string& where, const std::function<void()>&
   }
 }
 
+void FusionNodelet::reportOverflow(const std::string& topic) {
+  health_.count("dropped: queue full, " + topic);
+  warn("overflow " + topic, topic +
+                                ": messages come faster than they are worked off; the oldest "
+                                "are dropped");
+}
+
 bool FusionNodelet::mayReport(const std::string& key) {
   std::lock_guard<std::mutex> lock(report_mutex_);
   const auto now = Health::Clock::now();
@@ -170,8 +197,8 @@ void FusionNodelet::watch() {
   if (now - started_ < kSilence || now - watched_ < kSilence) return;
   watched_ = now;
   const bool is_silent = !health_.publishedWithin(kSilence);
-  if (is_silent && ros::Time::isSimTime() && ros::Time::now().isZero()) {
-    warn("clock", "use_sim_time is true but /clock is silent; play with --clock");
+  if (is_silent && clockIsSilent()) {
+    warn("clock", kSilentClock);
     return;
   }
   const std::string idle = explainSilence();

@@ -22,6 +22,7 @@
 #include <utility>
 
 #include "health.h"
+#include "inbox.h"
 #include "semantic_lidar_fusion/config/rig.h"
 
 namespace semantic_lidar_fusion {
@@ -89,7 +90,8 @@ class FusionNodelet : public nodelet::Nodelet {
   /// Runs `work`; no exception leaves. Errors are counted, reported (throttled) and shown.
   void guard(const std::string& where, const std::function<void()>& work);
 
-  /// Subscribes a member function: counted, guarded, without Nagle's delay. `queue_size` > 0.
+  /// Subscribes a member function: counted, guarded, without Nagle's delay. `queue_size` > 0
+  /// messages wait for their turn on the handle's queue; see Inbox.
   template <class M, class T>
   ros::Subscriber subscribe(ros::NodeHandle& handle, const std::string& topic, int queue_size,
                             void (T::*callback)(const boost::shared_ptr<const M>&)) {
@@ -103,17 +105,25 @@ class FusionNodelet : public nodelet::Nodelet {
   ros::Subscriber subscribe(ros::NodeHandle& handle, const std::string& topic, int queue_size,
                             const std::function<void(const boost::shared_ptr<const M>&)>& callback,
                             Health::Expect expect = Health::Expect::kStream) {
+    using Pointer = boost::shared_ptr<const M>;
     const std::string resolved = handle.resolveName(topic);
     health_.expectInput(resolved, expect);
-    const boost::function<void(const boost::shared_ptr<const M>&)> guarded =
-        [this, gate = gate_, resolved, callback](const boost::shared_ptr<const M>& message) {
-          gate->pass([&] {
-            health_.received(resolved);
-            guard(resolved, [&] { callback(message); });
-          });
-        };
-    return handle.subscribe<M>(topic, static_cast<uint32_t>(queue_size), guarded,
-                               ros::VoidConstPtr(), ros::TransportHints().tcpNoDelay());
+    const auto inbox = boost::make_shared<Inbox<Pointer>>(
+        handle.getCallbackQueue(), static_cast<std::size_t>(queue_size),
+        [this, gate = gate_, resolved, callback](const Pointer& message) {
+          gate->pass([&] { guard(resolved, [&] { callback(message); }); });
+        },
+        [this, resolved] { reportOverflow(resolved); });
+    const boost::function<void(const Pointer&)> store = [this, gate = gate_, resolved,
+                                                         inbox](const Pointer& message) {
+      gate->pass([&] {
+        health_.received(resolved);
+        inbox->add(message);
+      });
+    };
+    // On the manager's threads, whatever this nodelet is busy with.
+    return getMTNodeHandle().subscribe<M>(resolved, kTransportQueue, store, ros::VoidConstPtr(),
+                                          ros::TransportHints().tcpNoDelay());
   }
 
   /// Ends a subscription, if it is one; what it waited for is no longer missed.
@@ -155,7 +165,14 @@ class FusionNodelet : public nodelet::Nodelet {
   void watch();
   /// The simulated clock and how long it has stood still, both in ns.
   std::pair<StampNs, StampNs> simulatedClock() const;
+  void reportOverflow(const std::string& topic);
   void keepQueues();
+  /// Tells, latched, which version runs with which rig.
+  void publishConfiguration();
+
+  /// Messages between roscpp and an Inbox, which takes them at once: never reached unless all
+  /// threads of the manager are busy for long.
+  static constexpr uint32_t kTransportQueue = 256;
 
   /// A callback that runs while the nodelet is unloaded holds it until it returns, and the manager
   /// has destroyed the queues by then, into which timers and publishers reach as they end.
@@ -173,6 +190,7 @@ class FusionNodelet : public nodelet::Nodelet {
   Health::Clock::time_point started_ = Health::Clock::now();
   Health::Clock::time_point watched_ = started_;
   std::unique_ptr<diagnostic_updater::Updater> diagnostics_;
+  ros::Publisher configuration_;
   ros::WallTimer diagnostics_timer_, tick_timer_;
 };
 

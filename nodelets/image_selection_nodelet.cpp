@@ -53,7 +53,8 @@ class ImageSelectionNodelet : public FusionNodelet {
   void initialize() override {
     selector_ = std::make_unique<ScanSelector>(rig().selectorConfig());
     // The motion nodelet decodes the same messages, and counts.
-    lidar_ = std::make_unique<LidarDecoder>(rig().lidar, [](const std::string&, std::uint64_t) {});
+    lidar_ = std::make_unique<LidarDecoder>(
+        rig().lidar, [](const std::string&, std::uint64_t, LidarDecoder::Discarded) {});
     sweep_ = rig().image_choice == ImageChoice::kClosestToSweep;
     if (sweep_) tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
     reference_ = advertise<sensor_msgs::TimeReference>(getNodeHandle(), "scan_reference", 16);
@@ -200,7 +201,7 @@ class ImageSelectionNodelet : public FusionNodelet {
 
   /// False for a stamp that cannot be used; starts anew after a clock jump.
   bool usable(const std::string& topic, StampNs stamp) {
-    if (stamp == 0) {
+    if (stamp <= 0) {
       health().count("dropped: stamp 0 on " + topic);
       error("stamp " + topic, topic + ": header.stamp is 0; it must be the time of measurement");
       return false;
@@ -234,17 +235,25 @@ class ImageSelectionNodelet : public FusionNodelet {
       if (decision.timed_out) {
         health().problem("t_ref is the middle of the scan: no reference image in time");
       }
-      publish(reference_, boost::make_shared<sensor_msgs::TimeReference>(
-                              scanReferenceMessage(decision.scan_ns, decision.reference_ns)));
+      guard("scan_reference", [&] {
+        publish(reference_, boost::make_shared<sensor_msgs::TimeReference>(
+                                scanReferenceMessage(decision.scan_ns, decision.reference_ns)));
+      });
     }
-    for (const SelectionDecision& decision : decisions.selections) publishSelection(decision);
-    const SelectorCounters& counters = selector_->counters();
-    const std::uint64_t overflow = counters.scans_dropped_pending;
-    if (overflow > reported_overflow_) {
-      health().count("dropped: scan, too many wait for images", overflow - reported_overflow_);
-      reported_overflow_ = overflow;
-      warn("overflow", "a scan is dropped: too many wait for images");
+    for (const SelectionDecision& decision : decisions.selections) {
+      guard("selection", [&] { publishSelection(decision); });
     }
+    for (const DroppedScan& scan : decisions.dropped) {
+      if (scan.reason == DropReason::kQueueFull) {
+        health().count("dropped: scan, too many wait for images");
+        warn("overflow", "a scan is dropped: too many wait for images");
+      } else {
+        health().count("dropped: scan pending at a clock jump");
+      }
+    }
+    const std::uint64_t duplicates = selector_->counters().scans_duplicate;
+    health().count("dropped: scan of a known stamp", duplicates - reported_duplicates_);
+    reported_duplicates_ = duplicates;
     health().set("pending scans", std::to_string(selector_->pendingScans()));
   }
 
@@ -290,7 +299,7 @@ class ImageSelectionNodelet : public FusionNodelet {
   bool sweep_ = false;
   EpochMonitor epoch_;
   std::vector<std::unique_ptr<Camera>> cameras_;
-  std::uint64_t reported_overflow_ = 0;
+  std::uint64_t reported_duplicates_ = 0;
   ros::Publisher reference_;
   ros::Subscriber lidar_subscriber_;
 };

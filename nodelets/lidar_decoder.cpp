@@ -71,21 +71,22 @@ TimedCloud LidarDecoder::decode(const VelodyneScan& message) {
   DecodedScan scan = packets_.decode(packets(message), stampNs(message.header.stamp),
                                      frame(message.header.frame_id));
   const PacketCounters& counters = scan.counters;
-  count_drops_("duplicate packets", counters.duplicate_packets);
-  count_drops_("packets of zeros", counters.zero_packets);
-  count_drops_("bad packet blocks", counters.bad_blocks);
-  count_drops_("points out of range", counters.out_of_range_points);
-  count_drops_("second returns equal to the first", counters.equal_returns);
+  count_drops_("duplicate packets", counters.duplicate_packets, Discarded::kFault);
+  count_drops_("packets of zeros", counters.zero_packets, Discarded::kFault);
+  count_drops_("bad packet blocks", counters.bad_blocks, Discarded::kFault);
+  count_drops_("points out of range", counters.out_of_range_points, Discarded::kAsIntended);
+  count_drops_("second returns equal to the first", counters.equal_returns, Discarded::kAsIntended);
   for (const auto& [reason, count] : counters.unknown_packets) {
-    count_drops_("packets with " + reason, count);
+    count_drops_("packets with " + reason, count, Discarded::kFault);
   }
   return std::move(scan.cloud);
 }
 
 TimedCloud LidarDecoder::decode(const sensor_msgs::PointCloud2& message) {
   ReadCloud read = clouds_.read(cloudBytes(message, frame(message.header.frame_id)));
-  count_drops_("points that are not finite", read.counters.non_finite_points);
-  count_drops_("points out of range", read.counters.out_of_range_points);
+  count_drops_("points that are not finite", read.counters.non_finite_points,
+               Discarded::kAsIntended);
+  count_drops_("points out of range", read.counters.out_of_range_points, Discarded::kAsIntended);
   if (!read.cloud.empty()) {
     time_decision_ = read.time.text;
     time_decision_is_doubtful_ = read.time.warning;

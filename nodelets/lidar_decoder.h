@@ -17,8 +17,11 @@ namespace semantic_lidar_fusion {
 
 class LidarDecoder {
  public:
-  /// Told of what was discarded: reason and number.
-  using CountDrops = std::function<void(const std::string& reason, std::uint64_t count)>;
+  /// Whether what was discarded should have been sound.
+  enum class Discarded : std::uint8_t { kFault, kAsIntended };
+  /// Told of what was discarded: reason, number (0 too), and whether that is a fault.
+  using CountDrops =
+      std::function<void(const std::string& reason, std::uint64_t count, Discarded kind)>;
 
   /// Throws ConfigError.
   LidarDecoder(const LidarConfig& config, CountDrops count_drops);

@@ -46,10 +46,9 @@ class MotionCompensationNodelet : public FusionNodelet {
   };
 
   void initialize() override {
-    lidar_ = std::make_unique<LidarDecoder>(rig().lidar,
-                                            [this](const std::string& reason, std::uint64_t count) {
-                                              health().count("dropped: " + reason, count);
-                                            });
+    lidar_ = std::make_unique<LidarDecoder>(
+        rig().lidar, [this](const std::string& reason, std::uint64_t count,
+                            LidarDecoder::Discarded kind) { onDiscarded(reason, count, kind); });
     // The selection nodelet settles t_ref within its own timeout; the rest is grace for its thread.
     longest_reference_wait_ns_ = toNs(rig().reference.timeout_s) + kReferenceGraceNs;
     tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
@@ -85,6 +84,10 @@ class MotionCompensationNodelet : public FusionNodelet {
     reportTimeDecision();
     scan.interval = scanInterval(scan.cloud);
     scan.arrived_ns = now();
+    if (scan.interval.first_ns <= 0) {  // the selection nodelet says it; it is no jump of time
+      health().count("dropped: scan of stamp 0");
+      return;
+    }
     if (!current("lidar", scan.interval.first_ns)) return;
     pending_.push_back(std::move(scan));
     if (pending_.size() > kMaxPendingScans) {
@@ -94,6 +97,18 @@ class MotionCompensationNodelet : public FusionNodelet {
                           " others wait for odometry or scan_reference");
     }
     release();
+  }
+
+  void onDiscarded(const std::string& reason, std::uint64_t count, LidarDecoder::Discarded kind) {
+    if (count == 0) return;
+    if (kind == LidarDecoder::Discarded::kAsIntended) {
+      health().count("left out: " + reason, count);
+      return;
+    }
+    health().count("dropped: " + reason, count);
+    const std::string topic = getNodeHandle().resolveName(rig().lidar.topic);
+    warn("lidar " + reason, topic + ": " + std::to_string(count) + " " + reason +
+                                " in a scan; the rest of the scan is used");
   }
 
   /// Tells once how the times of the points are understood.
@@ -143,8 +158,8 @@ class MotionCompensationNodelet : public FusionNodelet {
         empty.frame_id = scan.cloud.frame_id;
         empty.stamp = empty.first_point_ns = scan.cloud.header_stamp;
         health().count("empty scans");
-        publish(output_, compensatedCloudMessage(empty));
         pending_.pop_front();
+        publish(output_, compensatedCloudMessage(empty));
         continue;
       }
       const Reference* reference = references_.find(scan.interval.first_ns);
@@ -173,8 +188,9 @@ class MotionCompensationNodelet : public FusionNodelet {
                              std::to_string(rig().odometry.timeout_s) +
                              " s: " + (T_vehicle_lidar ? gap : T_vehicle_lidar.message));
       }
-      publishCompensated(scan, t_ref, T_vehicle_lidar);
-      pending_.pop_front();
+      const Scan leaving = std::move(pending_.front());
+      pending_.pop_front();  // first: an error must not meet it again
+      publishCompensated(leaving, t_ref, T_vehicle_lidar);
     }
   }
 

@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: MIT
 #include "parameters.h"
 
+#include <algorithm>
 #include <iomanip>
 #include <limits>
+#include <set>
 #include <sstream>
 #include <vector>
 
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/yaml_reader.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -96,6 +99,28 @@ Rig loadRigFromParameters(const ros::NodeHandle& node) {
   }
   throw ConfigError({"no rig: neither parameter " + node.resolveName("rig_file") + " nor " +
                      node.resolveName("rig") + ", nor one of these names in a namespace above"});
+}
+
+std::vector<std::string> unknownParameters(const ros::NodeHandle& node) {
+  // `camera` is the superpixel nodelet's, `diagnostic_period` the diagnostic updater's.
+  static const std::vector<std::string> kKnown = {"rig_file",  "rig",    "rig_directory",
+                                                  "overrides", "camera", "diagnostic_period"};
+  std::vector<std::string> names, problems;
+  node.getParamNames(names);
+  const std::string prefix = node.getNamespace() + "/";
+  std::set<std::string> seen;
+  for (const std::string& name : names) {
+    if (name.compare(0, prefix.size(), prefix) != 0) continue;
+    const std::string key =
+        name.substr(prefix.size(), name.find('/', prefix.size()) - prefix.size());
+    if (std::find(kKnown.begin(), kKnown.end(), key) != kKnown.end() || !seen.insert(key).second) {
+      continue;
+    }
+    const std::string meant = nearestName(key, kKnown);
+    problems.push_back("parameter " + prefix + key + ": nothing reads it" +
+                       (meant.empty() ? "" : "; is '" + meant + "' meant?"));
+  }
+  return problems;
 }
 
 }  // namespace semantic_lidar_fusion

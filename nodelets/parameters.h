@@ -7,6 +7,7 @@
 #include <yaml-cpp/yaml.h>
 
 #include <string>
+#include <vector>
 
 #include "semantic_lidar_fusion/config/rig.h"
 
@@ -24,5 +25,9 @@ YAML::Node yamlTree(XmlRpc::XmlRpcValue value, const std::string& key);
 ///   overrides      list of "key=value" (see loadRig), or one string of them separated by blanks.
 /// Throws ConfigError with every problem.
 Rig loadRigFromParameters(const ros::NodeHandle& node);
+
+/// One line for each parameter in the node's namespace that nothing reads, with the name that it
+/// may have been meant for.
+std::vector<std::string> unknownParameters(const ros::NodeHandle& node);
 
 }  // namespace semantic_lidar_fusion

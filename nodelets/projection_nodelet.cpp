@@ -258,10 +258,13 @@ class ProjectionNodelet : public FusionNodelet {
                                    cloud.stamp, tf_->source().odometry(),
                                    T_vehicle_lidar.transform));
     }
-    const FusionResult result = chain_->fused(cloud, std::move(views));
+    const bool drawn = std::any_of(cameras_.begin(), cameras_.end(), [](const auto& camera) {
+      return camera->overlay.getNumSubscribers() > 0;
+    });
+    const FusionResult result = chain_->fused(cloud, std::move(views), drawn);
     countPoints(result.cloud);
     publish(output_, semanticCloudMessage(result.cloud, rig().classes));
-    publishOverlays(scan, result);
+    if (drawn) publishOverlays(scan, result);
   }
 
   /// Model and extrinsics; no model if either is unknown.
@@ -298,6 +301,7 @@ class ProjectionNodelet : public FusionNodelet {
       health().problem(name + ": semantics left the buffer");
       return std::nullopt;
     }
+    health().count(name + ": images used");
     SegmentedImage image;
     image.stamp = state.image_stamp;
     if (known->probabilities) {

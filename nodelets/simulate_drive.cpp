@@ -49,6 +49,9 @@ options:
   --camera-drop M      cameras below the lidar, -1 to 1.2 (default 0.2); also --lidar-offset
   --image-rate HZ      1 to 100 (default 30)
   --images all|selected  also render images that no scan uses (default selected)
+  --image-choice closest_to_reference|closest_to_sweep
+                       as in the rig file: which images a scan uses, and truth is told for
+                       (default closest_to_reference)
   --raw                images as sensor_msgs/Image, not JPEG (set transport: raw in the rig)
   --static             nobody else moves
   --perfect-network    scores of the true class, at the images' resolution
@@ -127,6 +130,14 @@ SimulationOptions parseOptions(const std::vector<std::string>& arguments) {
         throw UsageError("--images is '" + which + "'; it must be all or selected");
       }
       options.all_images = which == "all";
+    } else if (name == "--image-choice") {
+      const std::string& choice = value();
+      if (choice != "closest_to_reference" && choice != "closest_to_sweep") {
+        throw UsageError("--image-choice is '" + choice +
+                         "'; it must be closest_to_reference or closest_to_sweep");
+      }
+      options.image_choice = choice == "closest_to_sweep" ? ImageChoice::kClosestToSweep
+                                                          : ImageChoice::kClosestToReference;
     } else if (name == "--raw") {
       options.raw_images = true;
     } else if (name == "--static") {
@@ -187,5 +198,6 @@ int main(int argc, char** argv) {
   action.sa_handler = semantic_lidar_fusion::simulator::rememberSignal;
   ::sigaction(SIGINT, &action, nullptr);
   ::sigaction(SIGTERM, &action, nullptr);
+  ::signal(SIGXFSZ, SIG_IGN);  // a file size limit is then an error of the write
   return semantic_lidar_fusion::simulator::run(std::vector<std::string>(argv + 1, argv + argc));
 }

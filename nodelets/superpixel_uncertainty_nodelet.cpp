@@ -44,6 +44,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     const CameraConfig& config;
     std::mutex mutex;  ///< guards what follows, up to the publishers
     CameraSemantics semantics;
+    std::string told_clamping;
     EpochMonitor epoch;
     StampedStore<sensor_msgs::ImageConstPtr> images{kWaiting};
     StampedStore<sensor_msgs::ImageConstPtr> scores{kWaitingScores};
@@ -161,9 +162,19 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
 
   void cluster(Camera* camera, StampNs stamp, const sensor_msgs::ImageConstPtr& image,
                const ImageSize& map_size) {
+    tellClamping(camera, map_size);
     const StageTimer timer(health(), "superpixels");
     camera->maps.put(stamp, std::make_shared<const SuperpixelMap>(
                                 camera->semantics.cluster(colorImage(image), map_size, stamp)));
+  }
+
+  /// Tells once, and in the diagnostics, that a map is too small for the wanted superpixels.
+  void tellClamping(Camera* camera, const ImageSize& map_size) {
+    const std::string note = camera->semantics.clampNote(map_size);
+    if (note.empty() || note == camera->told_clamping) return;
+    camera->told_clamping = note;
+    health().set(camera->config.name + " superpixels", note);
+    NODELET_INFO_STREAM(camera->config.name << ": " << note);
   }
 
   using Outputs = std::vector<std::pair<const ros::Publisher*, sensor_msgs::ImagePtr>>;

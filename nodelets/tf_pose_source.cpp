@@ -166,8 +166,12 @@ std::string TfPoseSource::gap(StampNs from_ns, StampNs to_ns) {
                                : "odometry of " + config_.vehicle_frame;
   const std::string wanted = "; wanted " + seconds(from_ns) + " to " + seconds(to_ns);
   if (!poses.empty()) {
-    return name + " is known from " + seconds(poses.readings().front().stamp) + " to " +
-           seconds(poses.readings().back().stamp) + wanted;
+    const StampNs first = poses.readings().front().stamp, last = poses.readings().back().stamp;
+    const bool forgotten = config_.history_ns > 0 && from_ns < last - config_.history_ns;
+    return name + " is known from " + seconds(first) + " to " + seconds(last) + wanted +
+           (forgotten ? ", which is older than the " + seconds(config_.history_ns) +
+                            " s that are kept; does the lidar's clock lag (lidar.time_offset)?"
+                      : "");
   }
   if (config_.source == OdometrySource::kTopic) {
     if (pending_.empty()) return name + " was never received" + wanted;

@@ -22,23 +22,25 @@ class TfSubscription {
  public:
   /// History of transforms and readings; longer than any wait.
   static constexpr StampNs kHistoryNs = 10 * kNsPerSecond;
+  /// Small messages that wait while a scan is worked on: seconds of a busy tree.
+  static constexpr uint32_t kQueue = 1000;
 
   TfSubscription(ros::NodeHandle& handle, const Rig& rig)
       : source_(tfPoseSourceConfig(rig, kHistoryNs)) {
     const auto hints = ros::TransportHints().tcpNoDelay();
     static_ = handle.subscribe<tf2_msgs::TFMessage>(
-        "/tf_static", 100,
+        "/tf_static", kQueue,
         boost::function<void(const tf2_msgs::TFMessageConstPtr&)>(
             [this](const tf2_msgs::TFMessageConstPtr& message) { add(*message, true); }),
         ros::VoidConstPtr(), hints);
     moving_ = handle.subscribe<tf2_msgs::TFMessage>(
-        "/tf", 100,
+        "/tf", kQueue,
         boost::function<void(const tf2_msgs::TFMessageConstPtr&)>(
             [this](const tf2_msgs::TFMessageConstPtr& message) { add(*message, false); }),
         ros::VoidConstPtr(), hints);
     if (rig.odometry.source == OdometrySource::kTopic) {
       odometry_ = handle.subscribe<nav_msgs::Odometry>(
-          rig.odometry.topic, 100,
+          rig.odometry.topic, kQueue,
           boost::function<void(const nav_msgs::OdometryConstPtr&)>(
               [this](const nav_msgs::OdometryConstPtr& message) {
                 if (current(message->child_frame_id, message->header.stamp)) source_.add(*message);

@@ -25,14 +25,15 @@ debian_ros="catkin libroscpp-dev libnodelet-dev libnodeletlib-dev libnodeletlib-
   libstd-msgs-dev libgeometry-msgs-dev libdiagnostic-msgs-dev libroslib-dev librosbag-dev
   librosbag-storage-dev librostest-dev python3-catkin-pkg python3-roslaunch python3-rosbag
   python3-rospy python3-cv-bridge python3-tf2-ros python3-tf2-msgs python3-sensor-msgs
-  python3-nav-msgs python3-std-msgs python3-geometry-msgs python3-diagnostic-msgs
+  python3-nav-msgs python3-std-msgs python3-std-srvs python3-geometry-msgs python3-diagnostic-msgs
   python3-rostopic python3-rosnode python3-rosparam python3-rostest python3-rosunit rosbash
   rospack-tools tf2-tools"
 # name on Ubuntu 20.04 with the ROS Noetic repository
 noetic_ros="ros-noetic-catkin ros-noetic-roscpp ros-noetic-nodelet ros-noetic-pluginlib
   ros-noetic-cv-bridge ros-noetic-tf2 ros-noetic-tf2-ros ros-noetic-tf2-eigen ros-noetic-tf2-msgs
   ros-noetic-message-filters ros-noetic-diagnostic-updater ros-noetic-sensor-msgs
-  ros-noetic-nav-msgs ros-noetic-std-msgs ros-noetic-geometry-msgs ros-noetic-diagnostic-msgs
+  ros-noetic-nav-msgs ros-noetic-std-msgs ros-noetic-std-srvs ros-noetic-geometry-msgs
+  ros-noetic-diagnostic-msgs
   ros-noetic-roslib ros-noetic-rosbag ros-noetic-rosbag-storage ros-noetic-roslaunch
   ros-noetic-rospy ros-noetic-rostopic ros-noetic-rosnode ros-noetic-rosparam ros-noetic-rostest
   ros-noetic-rosunit ros-noetic-rosbash ros-noetic-tf2-tools"
@@ -41,6 +42,11 @@ common="build-essential cmake libeigen3-dev libopencv-dev libyaml-cpp-dev libgte
   python3-tqdm python3-yaml"
 # Each of these only adds something: the simulator, the map's bindings, export and clusters, ...
 optional="libembree-dev liboctomap-dev pybind11-dev python3-dev python3-dask python3-distributed"
+if [ -d /opt/ros/noetic ]; then
+  optional="$optional ros-noetic-map-msgs"
+else
+  optional="$optional python3-map-msgs"
+fi
 # ... oracles and peers in tests and benchmarks, the format checks, the fuzzers.
 if [ "$testing" = 1 ]; then
   optional="$optional libopencv-contrib-dev clang-format black libbenchmark-dev pcl-tools

@@ -25,6 +25,7 @@
 #include "camera.h"
 #include "conversions.h"
 #include "drive_path.h"
+#include "fusion_chain.h"
 #include "lidar.h"
 #include "network.h"
 #include "noise.h"
@@ -298,6 +299,8 @@ class Simulation {
   void selectImages() {
     SelectorConfig config;
     config.cameras.resize(cameras_.size());
+    config.image_choice = options_.image_choice;
+    const bool sweeps = options_.image_choice == ImageChoice::kClosestToSweep;
     ScanSelector selector(config);
     std::map<StampNs, std::size_t> scan_of;
     std::size_t next_image = 0;
@@ -318,7 +321,15 @@ class Simulation {
     for (std::size_t i = 0; i < scans_.size(); ++i) {
       addImagesUntil(scans_[i].record_ns);
       scan_of[scans_[i].interval.first_ns] = i;
-      selector.addScan({scans_[i].interval, {}}, scans_[i].record_ns);
+      SelectorScan scan{scans_[i].interval, {}};
+      for (const MountedCamera& mounted : cameras_) {
+        if (!sweeps) break;
+        const Transform T_camera_lidar = mounted.camera.T_base_camera().inverse() * lidarPose();
+        scan.sweep_ns.push_back(
+            sweepTime(scans_[i].cloud,
+                      {std::make_shared<CameraModel>(mounted.camera.model()), T_camera_lidar}));
+      }
+      selector.addScan(scan, scans_[i].record_ns);
       take(selector.advance(scans_[i].record_ns));
     }
     addImagesUntil(images_.back());

@@ -5,6 +5,8 @@
 #include <cstdint>
 #include <string>
 
+#include "semantic_lidar_fusion/sync/scan_selector.h"
+
 namespace semantic_lidar_fusion {
 namespace simulator {
 
@@ -20,6 +22,7 @@ struct SimulationOptions {
   bool exact_odometry = false;
   bool range_noise = true;
   bool perfect_network = false;
+  ImageChoice image_choice = ImageChoice::kClosestToReference;  ///< that scans are taken to make
   bool all_images = false;  ///< else only those that a scan uses
   bool raw_images = false;  ///< else JPEG
   bool force = false;

@@ -15,11 +15,11 @@ namespace simulator {
 namespace {
 
 // In cells of the score grid.
-constexpr float kBorderShift = 1.6F;     ///< standard size of the borders' displacement
-constexpr float kBorderPatch = 5.0F;     ///< over which it stays alike
-constexpr double kBlurSigma = 0.7;       ///< of the borders
+constexpr float kBorderShift = 1.6F;      ///< standard size of the borders' displacement
+constexpr float kBorderPatch = 5.0F;      ///< over which it stays alike
+constexpr double kBlurSigma = 0.7;        ///< of the borders
 constexpr float kConfusionPatch = 14.0F;  ///< size of patches of a wrong class
-constexpr float kGain = 10.5F;           ///< logit of a class that is all there is
+constexpr float kGain = 10.5F;            ///< logit of a class that is all there is
 constexpr float kFineNoise = 0.7F, kPatchNoise = 1.6F;
 constexpr int kSamples = 2;  ///< along each side of a cell
 /// Things this narrow keep their place within a fraction of their width.
@@ -113,20 +113,29 @@ cv::Mat shiftShare(const cv::Mat& samples) {
   return share;
 }
 
+/// Uniform in [0, 1], with patches of `size` cells.
+float patchQuantile(float x, float y, float size, std::uint32_t key) {
+  return 0.5F + 0.5F * std::erf(patchNoise(x, y, size, key) / 1.414F);
+}
+
 /// The class that a patch of a class is taken for, at a cell.
 int confused(int kind, float x, float y, std::uint32_t seed) {
-  // One number, uniform over the picture in patches, divides the class's wrong answers.
+  float all = 0.0F;
+  for (const Confusion& confusion : kConfusions) {
+    if (static_cast<int>(confusion.truth) == kind) all += confusion.share;
+  }
+  // One number tells where the network errs, another, of larger patches, for what.
   const auto patch = seed + 101U * static_cast<std::uint32_t>(kind);
-  const float quantile = 0.5F + 0.5F * std::erf(patchNoise(x, y, kConfusionPatch, patch) / 1.414F);
-  float offset = 0.0F;
+  if (patchQuantile(x, y, kConfusionPatch, patch) >= all) return kind;
+  float left = all * patchQuantile(x, y, 2.0F * kConfusionPatch, patch + 57U);
+  int other = kind;
   for (const Confusion& confusion : kConfusions) {
     if (static_cast<int>(confusion.truth) != kind) continue;
-    if (quantile >= offset && quantile < offset + confusion.share) {
-      return static_cast<int>(confusion.other);
-    }
-    offset += confusion.share;
+    other = static_cast<int>(confusion.other);
+    if (left < confusion.share) break;
+    left -= confusion.share;
   }
-  return kind;
+  return other;
 }
 
 }  // namespace

@@ -197,6 +197,11 @@ class BagReader:
             self._counts.get(name, 0) for name in (self.topics if topics is None else topics)
         )
 
+    def stamps_ns(self, topic: str) -> List[int]:
+        """Record times (ns) of a topic's messages, in order, from the bag's index alone."""
+        connections = self._bag._get_connections([topic])
+        return sorted(to_ns(entry.time) for entry in self._bag._get_entries(connections))
+
     def read(
         self,
         topics: Optional[Sequence[str]] = None,

@@ -86,6 +86,28 @@ class Rig:
         return result
 
 
+# The masks that evaluate.py --masks compares; the paper's has no angle but the one it is told.
+MASKS = (
+    Configuration("adaptive", ("occlusion.mode=adaptive",)),
+    Configuration(
+        "paper, 0.1 deg",
+        (
+            "occlusion.mode=paper",
+            "occlusion.vertical_step_deg=2",
+            "occlusion.horizontal_step_deg=0.1",
+        ),
+    ),
+    Configuration(
+        "paper, 0.2 deg",
+        (
+            "occlusion.mode=paper",
+            "occlusion.vertical_step_deg=2",
+            "occlusion.horizontal_step_deg=0.2",
+        ),
+    ),
+)
+
+
 def _text(value: Any) -> str:
     return "off" if value is False else str(value)  # YAML 1.1 reads a bare off as false
 
@@ -323,6 +345,9 @@ class Score:
         if self._min_edge_px > 0:
             require_fields(scan.points, ("edge_px",), "truth (for --min-edge-px)")
             chosen &= scan.points["edge_px"] > self._min_edge_px
+            cameras, visible = cloud.optional("cameras"), scan.flags("visible")
+            if cameras is not None and visible is not None:
+                chosen &= (cameras & ~visible) == 0
         return chosen
 
     def add(self, cloud: SemanticCloud, scan: TruthScan) -> None:
@@ -346,6 +371,14 @@ class Score:
         self.without_truth += int((truth == NO_LABEL).sum())
         self.confusion.add(truth, predicted)
         self.reliability.add(merged, truth, predicted, confidence)
+
+    def merge(self, other: "Score") -> None:
+        """Adds another drive's counts."""
+        self.confusion.merge(other.confusion)
+        self.reliability.merge(other.reliability)
+        self.status += other.status
+        self.scans += other.scans
+        self.without_truth += other.without_truth
 
     @property
     def points(self) -> int:
@@ -373,10 +406,12 @@ def score_bag(
     return score
 
 
-def mask_visibility(unmasked: FusedBag, masked: FusedBag, truth: Truth) -> Optional[Visibility]:
-    """What the mask catches and loses, of two runs that differ in the mask alone; None if the bag
-    has no truth about visibility."""
-    result = Visibility()
+def mask_visibility(
+    unmasked: FusedBag, masked: FusedBag, truth: Truth, into: Optional[Visibility] = None
+) -> Optional[Visibility]:
+    """What the mask catches and loses, of two runs that differ in the mask alone, added to `into`;
+    None if the bag has no truth about visibility."""
+    result = Visibility() if into is None else into
     for first, second in zip(paired(truth, unmasked), paired(truth, masked)):
         (index, cloud, scan), (other, with_mask, _) = first, second
         visible = scan.flags("visible")

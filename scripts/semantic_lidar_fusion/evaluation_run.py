@@ -10,7 +10,14 @@ from semantic_lidar_fusion import evaluation, image_truth, plotting, tables
 from semantic_lidar_fusion.bag_io import write_text
 from semantic_lidar_fusion.calibration import Variant
 from semantic_lidar_fusion.errors import DataError
-from semantic_lidar_fusion.evaluation import CalibrationCase, FusedBag, Rig, Score, Truth
+from semantic_lidar_fusion.evaluation import (
+    CalibrationCase,
+    Configuration,
+    FusedBag,
+    Rig,
+    Score,
+    Truth,
+)
 from semantic_lidar_fusion.labels import LabelSet
 from semantic_lidar_fusion.metrics import Visibility
 
@@ -41,6 +48,14 @@ class Results:
         self.plots.append(("f1.png", plotting.draw_f1, (rows, shown, confusions)))
         self.plots.append(("confusion.png", plotting.draw_confusions, (rows, shown, confusions)))
         self.plots.append(("reliability.png", plotting.draw_reliability, (reliabilities,)))
+
+    def add_drives(self, drives: Sequence[Tuple[str, Sequence[Score]]]) -> None:
+        names = ", ".join(score.name for score in drives[0][1])
+        self.sections += ["## Each drive\n", names + ":\n", tables.f1_by_drive(drives)]
+
+    def add_masks(self, compared: Sequence[Tuple[str, str, Visibility]]) -> None:
+        self.sections += ["## Occlusion masks\n", tables.masks(compared)]
+        self.files["masks.csv"] = tables.masks_csv(compared)
 
     def add_live(self, same: Tuple[int, int, int], name: str) -> None:
         """same: scans that both have, those that are equal byte for byte, scans offline."""
@@ -104,44 +119,128 @@ def _truth(rig: Optional[Rig], path: str, labels: LabelSet) -> Truth:
 
 def _evaluate_drive(options: Any, results: Results, workspace: str) -> str:
     rig = Rig(options.rig, options.settings) if options.rig else None
-    bags: List[Tuple[str, str]] = []
-    if options.clouds:
-        bags = [(text.partition("=")[0], text.partition("=")[2]) for text in options.clouds]
-        labels = rig.labels if rig else evaluation.class_set_of(bags[0][1])
-        truth = _truth(rig, options.truth or options.bag, labels)
-    else:
+    title = "Evaluation of %s" % ", ".join(os.path.basename(bag) for bag in options.bags)
+    if options.masks:
         assert rig is not None
+        results.add_masks(_compare_masks(options, rig, workspace))
+        return title
+    if rig is not None:
         labels = rig.labels
-        truth = _truth(rig, options.truth or options.bag, labels)
-        program = evaluation.find_fuse_bag(options.fuse_bag)
-        common = list(options.settings) + evaluation.required_settings(rig)
-        for configuration in rig.configurations():
-            target = os.path.join(workspace, configuration.name + ".bag")
-            settings = common + list(configuration.settings)
-            evaluation.run_fuse_bag(program, options.bag, target, rig.path, settings)
-            bags.append((configuration.name, target))
-    pair = tables.mask_pair([name for name, _ in bags])
+    else:
+        labels = evaluation.class_set_of(options.clouds[0].partition("=")[2])
+    drives: List[Tuple[str, List[Score]]] = []
+    rates: Optional[Visibility] = None
+    for number, bag in enumerate(options.bags):
+        truth = _truth(rig, options.truth or bag, labels)
+        prefix = "%d_" % (number + 1) if len(options.bags) > 1 else ""
+        runs = _runs(options, rig, bag, workspace, prefix)
+        pair = tables.mask_pair([name for name, _ in runs])
+        if options.live:
+            runs.append(("live", options.live))
+        fused = [FusedBag(path, labels.names) for _, path in runs]
+        scores = [
+            evaluation.score_bag(name, entry, truth, labels, options.min_edge_px)
+            for (name, _), entry in zip(runs, fused)
+        ]
+        drives.append((os.path.splitext(os.path.basename(bag))[0], scores))
+        if pair is not None:
+            rates = evaluation.mask_visibility(fused[pair[0]], fused[pair[1]], truth, rates)
+    results.add_scores(_sum(drives), rates)
+    if len(drives) > 1:
+        results.add_drives(drives)
     if options.live:
-        bags.append(("live", options.live))
-    fused = [FusedBag(path, labels.names) for _, path in bags]
-    scores = [
-        evaluation.score_bag(name, bag, truth, labels, options.min_edge_px)
-        for (name, _), bag in zip(bags, fused)
-    ]
-    rates = None
-    if pair is not None:
-        rates = evaluation.mask_visibility(fused[pair[0]], fused[pair[1]], truth)
-    results.add_scores(scores, rates)
-    if options.live:
-        results.add_live(evaluation.compare_clouds(fused[-2], fused[-1]), bags[-2][0])
+        results.add_live(evaluation.compare_clouds(fused[-2], fused[-1]), runs[-2][0])
+    if options.map:
+        _add_maps(results, options, [name for name, _ in runs], fused, truth, labels)
     if options.fit_temperature:
         assert rig is not None
-        fit_bag = options.fit_on or options.bag
+        fit_bag = options.fit_on or bag
         fit_truth = _truth(rig, fit_bag, labels) if options.fit_on else truth
-        _compare(
-            results, program, rig, (fit_bag, fit_truth), (options.bag, truth), common, workspace
-        )
-    return "Evaluation of %s" % os.path.basename(options.bag)
+        program = evaluation.find_fuse_bag(options.fuse_bag)
+        common = list(options.settings) + evaluation.required_settings(rig)
+        _compare(results, program, rig, (fit_bag, fit_truth), (bag, truth), common, workspace)
+    return title
+
+
+def _runs(
+    options: Any, rig: Optional[Rig], bag: str, workspace: str, prefix: str
+) -> List[Tuple[str, str]]:
+    """Name and fused bag of each configuration of a drive."""
+    if options.clouds:
+        return [(text.partition("=")[0], text.partition("=")[2]) for text in options.clouds]
+    assert rig is not None
+    return [
+        (configuration.name, _fuse(options, rig, bag, workspace, prefix, configuration))
+        for configuration in rig.configurations()
+    ]
+
+
+def _fuse(
+    options: Any, rig: Rig, bag: str, workspace: str, prefix: str, configuration: Configuration
+) -> str:
+    program = evaluation.find_fuse_bag(options.fuse_bag)
+    target = os.path.join(workspace, "%s%s.bag" % (prefix, configuration.name))
+    settings = list(options.settings) + evaluation.required_settings(rig)
+    evaluation.run_fuse_bag(program, bag, target, rig.path, settings + list(configuration.settings))
+    return target
+
+
+def _sum(drives: Sequence[Tuple[str, Sequence[Score]]]) -> List[Score]:
+    """The drives' scores, configuration by configuration."""
+    if len(drives) == 1:
+        return list(drives[0][1])
+    first = drives[0][1]
+    total = [Score(score.name, score.labels) for score in first]
+    for _, scores in drives:
+        for target, score in zip(total, scores):
+            target.merge(score)
+    return total
+
+
+def _compare_masks(options: Any, rig: Rig, workspace: str) -> List[Tuple[str, str, Visibility]]:
+    """(drive, mask, what it does) for every drive and every mask of evaluation.MASKS."""
+    result = []
+    for bag in options.bags:
+        truth = _truth(rig, bag, rig.labels)
+        drive = os.path.splitext(os.path.basename(bag))[0]
+        open_view = Configuration("unmasked", ("occlusion.mode=off",))
+        unmasked = FusedBag(_fuse(options, rig, bag, workspace, "", open_view), rig.labels.names)
+        for mask in evaluation.MASKS:
+            target = Configuration("masked", mask.settings)
+            masked = FusedBag(_fuse(options, rig, bag, workspace, "", target), rig.labels.names)
+            rates = evaluation.mask_visibility(unmasked, masked, truth)
+            if rates is None:
+                raise DataError("%s: its points_truth has no field visible" % bag)
+            result.append((drive, mask.name, rates))
+    return result
+
+
+def _add_maps(
+    results: Results,
+    options: Any,
+    names: Sequence[str],
+    fused: Sequence[FusedBag],
+    truth: Truth,
+    labels: LabelSet,
+) -> None:
+    from semantic_lidar_fusion import map_evaluation
+    from semantic_lidar_fusion.semantic_map import MapConfig
+    from semantic_lidar_fusion.semantic_map_build import (
+        Drive,
+        choose_frame,
+        first_cloud,
+        transforms_of,
+    )
+
+    drive = Drive(fused[-1].path, tuple(options.bags))
+    frame_id = choose_frame(drive, first_cloud(drive), options.frame)
+    config = MapConfig(voxel_size_m=options.voxel).checked(len(labels))
+    compared = map_evaluation.evaluate_maps(
+        names, fused, truth, labels, transforms_of(drive), frame_id, config
+    )
+    section, files = map_evaluation.tables(compared)
+    results.sections.append(section)
+    results.files.update(files)
 
 
 def _compare(

@@ -45,6 +45,9 @@ class Confusion:
         cells = np.bincount(first * (rows + 1) + second, minlength=rows * (rows + 1))
         self.matrix += cells.reshape(rows, rows + 1)
 
+    def merge(self, other: "Confusion") -> None:
+        self.matrix += other.matrix
+
     @property
     def support(self) -> np.ndarray:
         """(R,) points of each true row."""
@@ -119,6 +122,13 @@ class Reliability:
         self.count += np.bincount(place, minlength=bins)
         self.confidence_sum += np.bincount(place, weights=confidence, minlength=bins)
         self.right_count += np.bincount(place[predicted == truth], minlength=bins)
+
+    def merge(self, other: "Reliability") -> None:
+        self.count += other.count
+        self.confidence_sum += other.confidence_sum
+        self.right_count += other.right_count
+        self._log_loss += other._log_loss
+        self._brier += other._brier
 
     @property
     def total(self) -> int:

@@ -153,6 +153,33 @@ def visibility_csv(rates: Visibility) -> str:
     return csv_text(["what", "points", "share"], rates.rows())
 
 
+def masks(results: Sequence[Tuple[str, str, Visibility]]) -> str:
+    """Rates of masks: (drive, mask, what it does) in rows."""
+    names = [row[0] for row in results[0][2].rows()]
+    rows = []
+    for drive, mask, rates in results:
+        cells = ["%s of %d" % (number(share, 4), points) for _, points, share in rates.rows()]
+        rows.append([drive, mask] + cells)
+    return markdown(["drive", "mask"] + names, rows)
+
+
+def masks_csv(results: Sequence[Tuple[str, str, Visibility]]) -> str:
+    rows = [[drive, mask] + row for drive, mask, rates in results for row in rates.rows()]
+    return csv_text(["drive", "mask", "what", "points", "share"], rows)
+
+
+def f1_by_drive(drives: Sequence[Tuple[str, Sequence[Score]]]) -> str:
+    """F1 of each class on each drive, from the first configuration to the last."""
+    shown = sorted({index for _, scores in drives for index in present_rows(scores)})
+    rows = []
+    for index in shown:
+        row = [title_of(drives[0][1][0].rows[index])]
+        for _, scores in drives:
+            row.append(", ".join(number(float(s.confusion.f1[index])) for s in scores))
+        rows.append(row)
+    return markdown(["F1"] + [name for name, _ in drives], rows)
+
+
 _TEMPERATURE = ["temperature", "exponent", "nll", "brier", "ece", "accuracy", "points"]
 
 

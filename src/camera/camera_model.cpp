@@ -354,6 +354,21 @@ double CameraModel::theta(const Eigen::Vector3d& p_camera) const {
   return std::atan2(std::hypot(p.x(), p.y()), p.z());
 }
 
+double CameraModel::maxThetaWithin(double margin_px) const {
+  if (distortion_ == DistortionModel::kBrownConrady) return max_theta_rad_;
+  // The distorted radius is largest in a corner, and it grows with the angle.
+  double radius = 0.0;
+  for (const double u : {-0.5 - margin_px, size_.width - 0.5 + margin_px}) {
+    for (const double v : {-0.5 - margin_px, size_.height - 0.5 + margin_px}) {
+      const double y = (v - cy_) / fy_;
+      radius = std::max(radius, std::hypot((u - cx_) / fx_ - skew_ * y, y));
+    }
+  }
+  if (distortion_ == DistortionModel::kPinhole) return std::min(std::atan(radius), max_theta_rad_);
+  if (radius >= distortedTheta(d_, max_theta_rad_)) return max_theta_rad_;
+  return bisect([&](double t) { return distortedTheta(d_, t) - radius; }, 0.0, max_theta_rad_);
+}
+
 std::optional<Eigen::Vector2d> CameraModel::project(const Eigen::Vector3d& p_camera) const {
   const Eigen::Vector3d p = R_raw_camera_ * (p_camera - optical_centre_);
   Eigen::Vector2d a;  // x', y' of eq. 10

@@ -10,6 +10,7 @@
 #include <utility>
 
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/thread_pool.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 
 namespace semantic_lidar_fusion {
@@ -64,22 +65,36 @@ std::string resolved(const std::string& path, const std::string& base_directory)
   return (std::filesystem::path(base_directory) / path).lexically_normal().string();
 }
 
+bool isReadableFile(const std::string& path) {
+  std::error_code error;
+  return std::filesystem::is_regular_file(path, error) && std::ifstream(path).good();
+}
+
+std::string unreadable(const std::string& path) {
+  return "must be a readable file; '" + path + "' is not";
+}
+
 /// Replaces a path by its resolved form; a file that cannot be read is a problem.
 void readPath(YamlSection& section, const std::string& key, const std::string& base_directory,
               std::string* path) {
   section.text(key, path);
   if (path->empty()) return;
   *path = resolved(*path, base_directory);
-  std::error_code error;
-  if (!std::filesystem::is_regular_file(*path, error) || !std::ifstream(*path).good()) {
-    section.problem(key, "must be a readable file; '" + *path + "' is not");
-  }
+  if (!isReadableFile(*path)) section.problem(key, unreadable(*path));
 }
 
-LabelSet readClasses(const YAML::Node& node, const std::string& base_directory,
-                     const std::string& source_name, Problems* problems) {
+/// `key`: where `node` stands, "classes" or "classes.file".
+LabelSet readClasses(const YAML::Node& node, const std::string& key,
+                     const std::string& base_directory, const std::string& source_name,
+                     Problems* problems) {
   try {
-    if (node.IsScalar()) return LabelSet::fromFile(resolved(node.Scalar(), base_directory));
+    if (node.IsScalar()) {
+      const std::string path = resolved(node.Scalar(), base_directory);
+      if (isReadableFile(path)) return LabelSet::fromFile(path);
+      problems->push_back(source_name + ": " + key + " = " + describeValue(node) + ": " +
+                          unreadable(path));
+      return {};
+    }
     if (!node.IsMap() || !const_cast<const YAML::Node&>(node)["file"].IsDefined()) {
       return LabelSet::fromYaml(node, source_name + ": classes");
     }
@@ -93,8 +108,9 @@ LabelSet readClasses(const YAML::Node& node, const std::string& base_directory,
   section.text("file", &file);
   section.finish();
   for (const std::string& problem : own) problems->push_back(source_name + ": " + problem);
-  return own.empty() ? readClasses(YAML::Node(file), base_directory, source_name, problems)
-                     : LabelSet();
+  return own.empty()
+             ? readClasses(YAML::Node(file), "classes.file", base_directory, source_name, problems)
+             : LabelSet();
 }
 
 CameraConfig readCamera(const YAML::Node& node, std::size_t index,
@@ -186,7 +202,7 @@ void readModel(YamlSection& section, std::optional<LidarModel>* model) {
   }
   if (plain == "vlp16" || plain == "puck" || plain == "pucklite") {
     *model = LidarModel::kVlp16;
-  } else if (plain == "puckhires" || plain == "vlp16hires") {
+  } else if (plain == "puckhires" || plain == "vlp16hires" || plain == "hires") {
     *model = LidarModel::kPuckHiRes;
   } else if (plain == "vlp32c") {
     *model = LidarModel::kVlp32c;
@@ -257,7 +273,7 @@ SuperpixelConfig readSuperpixels(const YAML::Node& node, Problems* problems) {
   YamlSection section(node, "superpixels", problems);
   section.integer("count", &superpixels.count, 1, 10000000);
   section.number("compactness", &superpixels.compactness, {0, 1e6, true});
-  section.integer("iterations", &superpixels.iterations, 1, 1000);
+  section.integer("iterations", &superpixels.iterations, 1, 100);
   section.number("scale", &superpixels.scale, {0, 4});
   section.boolean("warm_start", &superpixels.warm_start);
   section.finish();
@@ -374,7 +390,7 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
   const YAML::Node classes = section.get("classes");
   rig.cameras = readCameras(section.get("cameras"), base_directory, &own);
   if (classes.IsDefined() && !classes.IsNull()) {
-    rig.classes = readClasses(classes, base_directory, source_name, problems);
+    rig.classes = readClasses(classes, "classes", base_directory, source_name, problems);
   } else if (!rig.cameras.empty()) {
     section.problem("classes", "must be {file: PATH} or a class set where there are cameras");
   }
@@ -400,6 +416,7 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
                                {"nearest_in_time", OverlapRule::kNearestInTime},
                                {"most_central", OverlapRule::kMostCentral}});
   section.boolean("keep_unlabelled", &rig.keep_unlabelled);
+  section.integer("threads", &rig.threads, 1, ThreadPool::kMaxThreads);
   section.finish();
   for (const std::string& problem : own) problems->push_back(source_name + ": " + problem);
   return rig;
@@ -530,6 +547,7 @@ Rig rigFromYaml(const YAML::Node& root, const std::string& base_directory,
   }
   Rig rig = readRig(tree, base_directory, source_name, &problems);
   if (!problems.empty()) throw ConfigError(std::move(problems));
+  rig.yaml = YAML::Dump(tree);
   return rig;
 }
 

@@ -7,7 +7,9 @@
 #include <limits>
 #include <string>
 
+#include "../superpixel/softmax_kernels.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/thread_pool.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -26,7 +28,8 @@ struct PointVotes {
   int count = 0;
 };
 
-void checkVotes(const std::vector<CameraVotes>& votes, std::size_t points, int class_count) {
+void checkVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, std::size_t points,
+                int class_count) {
   if (class_count < 1) {
     throw DataError("class_count " + std::to_string(class_count) + ": must be at least 1");
   }
@@ -40,8 +43,10 @@ void checkVotes(const std::vector<CameraVotes>& votes, std::size_t points, int c
       throw DataError(name + "rig_index must be in 0.." + std::to_string(kMaxCameras - 1));
     }
     const std::size_t n = camera.index.size();
+    const bool without_times =
+        camera.time_difference_ns.empty() && rule != OverlapRule::kNearestInTime;
     if (camera.probabilities.size() != n * static_cast<std::size_t>(class_count) ||
-        camera.time_difference_ns.size() != n || camera.theta.size() != n) {
+        (camera.time_difference_ns.size() != n && !without_times) || camera.theta.size() != n) {
       throw DataError(name + "arrays must have one entry for each of " + std::to_string(n) +
                       " points");
     }
@@ -93,16 +98,11 @@ void product(const PointVotes& point, int class_count, double* out) {
 }
 
 void write(const double* distribution, const PointVotes& point, std::size_t i,
-           double per_log_class_count, SemanticCloud* cloud) {
+           double per_log_class_count, const SoftmaxKernels& kernels, SemanticCloud* cloud) {
   const int class_count = cloud->class_count;
   float* out = &cloud->probabilities[i * static_cast<std::size_t>(class_count)];
-  double entropy = 0;
-  int label = 0;
-  for (int c = 0; c < class_count; ++c) {
-    out[c] = static_cast<float>(distribution[c]);
-    if (out[c] > out[label]) label = c;
-    if (distribution[c] > 0) entropy -= distribution[c] * std::log(distribution[c]);
-  }
+  const int label = kernels.narrow(distribution, class_count, out);
+  const double entropy = kernels.entropy(distribution, class_count);
   cloud->points.status[i] = static_cast<std::uint8_t>(PointStatus::kFused);
   cloud->label[i] = static_cast<std::uint8_t>(label);
   cloud->confidence[i] = out[label];
@@ -115,31 +115,30 @@ void write(const double* distribution, const PointVotes& point, std::size_t i,
   cloud->cameras[i] = cameras;
 }
 
-}  // namespace
-
-void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, SemanticCloud* cloud) {
-  const std::size_t points = cloud->points.size();
+/// Merges points [begin, end).
+void mergeRange(const std::vector<CameraVotes>& votes, OverlapRule rule, std::size_t begin,
+                std::size_t end, SemanticCloud* cloud) {
   const int class_count = cloud->class_count;
-  checkVotes(votes, points, class_count);
-  cloud->label.assign(points, kNoLabel);
-  cloud->confidence.assign(points, 0.0f);
-  cloud->entropy.assign(points, 1.0f);
-  cloud->cameras.assign(points, 0);
-  cloud->probabilities.assign(points * static_cast<std::size_t>(class_count), 0.0f);
-
   const double per_log_class_count = class_count > 1 ? 1.0 / std::log(class_count) : 0.0;
+  const SoftmaxKernels& kernels = softmaxKernels();
   std::vector<double> merged(static_cast<std::size_t>(class_count));
   std::array<std::size_t, kMaxCameras> next{};
+  for (std::size_t k = 0; k < votes.size(); ++k) {
+    const std::vector<std::uint32_t>& index = votes[k].index;
+    next[k] = static_cast<std::size_t>(std::lower_bound(index.begin(), index.end(), begin) -
+                                       index.begin());
+  }
   PointVotes point;
-  for (std::size_t i = 0; i < points; ++i) {
+  for (std::size_t i = begin; i < end; ++i) {
     point.count = 0;
     for (std::size_t k = 0; k < votes.size(); ++k) {
       const CameraVotes& camera = votes[k];
       const std::size_t row = next[k];
       if (row == camera.index.size() || camera.index[row] != i) continue;
-      point.votes[point.count++] = {&camera.probabilities[row * class_count],
-                                    camera.time_difference_ns[row], camera.theta[row],
-                                    camera.rig_index};
+      point.votes[point.count++] = {
+          &camera.probabilities[row * static_cast<std::size_t>(class_count)],
+          camera.time_difference_ns.empty() ? 0 : camera.time_difference_ns[row], camera.theta[row],
+          camera.rig_index};
       ++next[k];
     }
     if (point.count == 0) continue;
@@ -157,8 +156,31 @@ void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, Semanti
       }
       distribution = merged.data();
     }
-    write(distribution, point, i, per_log_class_count, cloud);
+    write(distribution, point, i, per_log_class_count, kernels, cloud);
   }
+}
+
+}  // namespace
+
+void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, SemanticCloud* cloud,
+                ThreadPool* pool) {
+  const std::size_t points = cloud->points.size();
+  checkVotes(votes, rule, points, cloud->class_count);
+  cloud->label.assign(points, kNoLabel);
+  cloud->confidence.assign(points, 0.0f);
+  cloud->entropy.assign(points, 1.0f);
+  cloud->cameras.assign(points, 0);
+  cloud->probabilities.assign(points * static_cast<std::size_t>(cloud->class_count), 0.0f);
+
+  constexpr std::size_t kShare = 4096;
+  if (pool == nullptr || points <= kShare) {
+    mergeRange(votes, rule, 0, points, cloud);
+    return;
+  }
+  pool->forEach(static_cast<int>((points + kShare - 1) / kShare), [&](int share) {
+    const std::size_t begin = kShare * static_cast<std::size_t>(share);
+    mergeRange(votes, rule, begin, std::min(points, begin + kShare), cloud);
+  });
 }
 
 }  // namespace semantic_lidar_fusion

@@ -28,6 +28,15 @@ std::optional<ImageSize> CameraSemantics::mapSize(const ImageSize& image) const 
                    std::max(1, static_cast<int>(std::floor(image.height * config_.scale)))};
 }
 
+std::string CameraSemantics::clampNote(const ImageSize& map_size) const {
+  const int most = clampedSuperpixelCount(slicConfig(config_), map_size);
+  if (most >= config_.count) return {};
+  return "superpixels.count = " + std::to_string(config_.count) + ": a map of " +
+         std::to_string(map_size.width) + "x" + std::to_string(map_size.height) +
+         " pixels holds no more than " + std::to_string(most) +
+         "; raise superpixels.scale for more";
+}
+
 void CameraSemantics::noteScores(const cv::Mat& scores) {
   if (!scores.empty()) scores_size_ = ImageSize{scores.cols, scores.rows};
 }

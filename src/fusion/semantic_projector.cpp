@@ -7,8 +7,10 @@
 #include <string>
 #include <utility>
 
+#include "semantic_lidar_fusion/common/cell_grid.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/common/label_set.h"
+#include "semantic_lidar_fusion/common/thread_pool.h"
 #include "semantic_lidar_fusion/projection/cloud_projector.h"
 
 namespace semantic_lidar_fusion {
@@ -38,6 +40,8 @@ void checkConfig(const FusionConfig& config) {
   nonNegative("occlusion.horizontal_step_deg", config.occlusion.horizontal_step_deg);
   nonNegative("occlusion.depth_margin_m", config.occlusion.depth_margin_m);
   nonNegative("occlusion.depth_margin_ratio", config.occlusion.depth_margin_ratio);
+  require(config.threads >= 1 && config.threads <= ThreadPool::kMaxThreads, "threads",
+          config.threads, "in 1.." + std::to_string(ThreadPool::kMaxThreads));
   if (!problems.empty()) throw ConfigError(problems);
 }
 
@@ -98,20 +102,20 @@ void checkViews(const std::vector<CameraView>& views, int class_count) {
 class GridTable {
  public:
   GridTable(const ImageSize& source, const ImageSize& target)
-      : column_(axis(source.width, target.width)), row_(axis(source.height, target.height)) {}
+      : column_(cellsUnderCentres(source.width, target.width)),
+        row_(cellsUnderCentres(source.height, target.height)) {}
+  /// From `source` through the grid `between`.
+  GridTable(const ImageSize& source, const ImageSize& between, const ImageSize& target)
+      : GridTable(source, between) {
+    const GridTable next(between, target);
+    for (int& column : column_) column = next.column(column);
+    for (int& row : row_) row = next.row(row);
+  }
 
   int column(int source_column) const { return column_[static_cast<std::size_t>(source_column)]; }
   int row(int source_row) const { return row_[static_cast<std::size_t>(source_row)]; }
 
  private:
-  static std::vector<int> axis(int source, int target) {
-    std::vector<int> cells(static_cast<std::size_t>(source));
-    for (int i = 0; i < source; ++i) {
-      cells[static_cast<std::size_t>(i)] = cellUnderCentre(i, source, target);
-    }
-    return cells;
-  }
-
   std::vector<int> column_, row_;
 };
 
@@ -141,26 +145,47 @@ class PixelDistribution {
         config_(config),
         class_count_(class_count),
         lazy_(semantics.probabilities.empty()),
-        superpixel_size_(sizeOf(lazy_ ? semantics.share : semantics.probabilities)),
-        to_superpixel_(image, superpixel_size_),
-        to_score_(lazy_ ? superpixel_size_ : ImageSize{},
-                  lazy_ ? semantics.scores.size() : ImageSize{}),
+        to_superpixel_(image, superpixelSize()),
+        to_score_(lazy_ ? image : ImageSize{}, superpixelSize(), semantics.scores.size()),
         scores_(static_cast<std::size_t>(class_count)) {}
+
+  /// Asks the memory for what `read` will need.
+  void prefetch(int column, int row) const {
+    const int q_column = to_superpixel_.column(column), q_row = to_superpixel_.row(row);
+    if (!lazy_) {
+      prefetchCell(semantics_.probabilities.ptr<float>(q_row), q_column);
+      return;
+    }
+    __builtin_prefetch(semantics_.share.ptr<float>(q_row) + q_column);
+    const float* scores = semantics_.scores.floatRow(to_score_.row(row));
+    if (scores != nullptr) prefetchCell(scores, to_score_.column(column));
+  }
 
   /// Writes class_count values that sum to 1; false if they are uniform for want of valid input.
   bool read(int column, int row, double* out) {
-    const int q_column = to_superpixel_.column(column);
-    const int q_row = to_superpixel_.row(row);
-    return lazy_ ? readScores(q_column, q_row, out) : readProbabilities(q_column, q_row, out);
+    const int q_column = to_superpixel_.column(column), q_row = to_superpixel_.row(row);
+    if (!lazy_) return readProbabilities(q_column, q_row, out);
+    const int score_column = to_score_.column(column), score_row = to_score_.row(row);
+    const float* scores = semantics_.scores.floatRow(score_row);
+    if (scores != nullptr) {
+      scores += static_cast<std::ptrdiff_t>(score_column) * class_count_;
+    } else {
+      semantics_.scores.read(score_column, score_row, scores_.data());
+      scores = scores_.data();
+    }
+    const double share = semantics_.share.at<float>(q_row, q_column);
+    return temperedSoftmax(scores, class_count_, share, config_, out);
   }
 
  private:
-  bool readScores(int q_column, int q_row, double* out) {
-    if (!semantics_.scores.read(to_score_.column(q_column), to_score_.row(q_row), scores_.data())) {
-      return uniform(out);
-    }
-    const double share = semantics_.share.at<float>(q_row, q_column);
-    return temperedSoftmax(scores_.data(), class_count_, share, config_, out);
+  ImageSize superpixelSize() const {
+    return sizeOf(lazy_ ? semantics_.share : semantics_.probabilities);
+  }
+
+  void prefetchCell(const float* row, int column) const {
+    const float* cell = row + static_cast<std::ptrdiff_t>(column) * class_count_;
+    __builtin_prefetch(cell);
+    __builtin_prefetch(cell + class_count_ - 1);
   }
 
   bool readProbabilities(int q_column, int q_row, double* out) const {
@@ -172,25 +197,22 @@ class PixelDistribution {
       valid = valid && p[c] >= 0;
       sum += p[c];
     }
-    if (!valid || !std::isfinite(sum) || !(sum > 0)) return uniform(out);
+    if (!valid || !std::isfinite(sum) || !(sum > 0)) {
+      std::fill(out, out + class_count_, 1.0 / class_count_);
+      return false;
+    }
     // What only rounding to float moved off 1 passes bit for bit.
     const double factor = std::abs(sum - 1.0) < 1e-6 ? 1.0 : 1.0 / sum;
     for (int c = 0; c < class_count_; ++c) out[c] = p[c] * factor;
     return true;
   }
 
-  bool uniform(double* out) const {
-    std::fill(out, out + class_count_, 1.0 / class_count_);
-    return false;
-  }
-
   const ImageSemantics& semantics_;
   const UncertaintyConfig& config_;
   int class_count_;
   bool lazy_;
-  ImageSize superpixel_size_;
   GridTable to_superpixel_;
-  GridTable to_score_;  ///< from superpixel pixels
+  GridTable to_score_;  ///< from image pixels, through superpixel pixels
   std::vector<float> scores_;
 };
 
@@ -214,9 +236,17 @@ void improve(PointStatus status, std::uint8_t* of_point) {
   }
 }
 
+/// What one camera says of a scan.
+struct CameraOutcome {
+  CameraVotes votes;                     ///< of visible points
+  std::vector<std::uint32_t> hidden;     ///< points that a nearer one hides
+  std::vector<std::uint32_t> would_see;  ///< points in view of a camera without an image
+  CameraFusionReport report;
+};
+
 /// Projection, occlusion, ego mask and transfer in one camera that has an image.
-CameraVotes vote(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
-                 const BeamGrid& grid, CameraFusionReport* report) {
+void vote(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
+          const BeamGrid& grid, bool with_pixels, CameraOutcome* outcome) {
   const CameraModel& model = *view.model;
   const ImageSize& size = model.imageSize();
   const double margin_px = castMarginPx(model, grid, config.occlusion);
@@ -226,52 +256,72 @@ CameraVotes vote(const Cloud& cloud, const CameraView& view, const FusionConfig&
 
   const EgoMask mask(view.ego_mask, size);
   PixelDistribution distribution(view.semantics, size, config.uncertainty, config.class_count);
-  const std::size_t classes = static_cast<std::size_t>(config.class_count);
-  CameraVotes votes;
-  votes.rig_index = view.rig_index;
+  struct Pixel {
+    int column, row;
+  };
+  std::vector<Pixel> pixels;  // of the votes
+  CameraVotes& votes = outcome->votes;
+  CameraFusionReport& report = outcome->report;
+  pixels.reserve(points.size());
   votes.index.reserve(points.size());
-  votes.time_difference_ns.reserve(points.size());
   votes.theta.reserve(points.size());
-  votes.probabilities.resize(points.size() * classes);
-  report->index.reserve(points.size());
-  report->u.reserve(points.size());
-  report->v.reserve(points.size());
-  report->status.reserve(points.size());
+  votes.rig_index = view.rig_index;
   for (std::size_t k = 0; k < points.size(); ++k) {
     const double u = points.u[k], v = points.v[k];
     if (!inImage(u, v, size)) continue;
     const int column = pixelIndex(u), row = pixelIndex(v);
     PointStatus status = visible[k] ? PointStatus::kFused : PointStatus::kOccluded;
     if (mask.hides(column, row)) status = PointStatus::kOutsideImages;
-    const std::uint32_t i = points.index[k];
-    report->index.push_back(i);
-    report->u.push_back(points.u[k]);
-    report->v.push_back(points.v[k]);
-    report->status.push_back(status);
-    if (status != PointStatus::kFused) continue;
-    if (!distribution.read(column, row, &votes.probabilities[votes.index.size() * classes])) {
-      ++report->nonfinite;
+    if (with_pixels) {
+      report.index.push_back(points.index[k]);
+      report.u.push_back(points.u[k]);
+      report.v.push_back(points.v[k]);
+      report.status.push_back(status);
     }
-    votes.index.push_back(i);
-    votes.time_difference_ns.push_back(std::abs(cloud.stamp + toNs(cloud.dt[i]) - view.image_ns));
-    votes.theta.push_back(points.theta[k]);
+    if (status == PointStatus::kFused) {
+      pixels.push_back({column, row});
+      votes.index.push_back(points.index[k]);
+      votes.theta.push_back(points.theta[k]);
+    } else if (status == PointStatus::kOccluded) {
+      outcome->hidden.push_back(points.index[k]);
+    }
   }
-  votes.probabilities.resize(votes.index.size() * classes);
-  return votes;
+  if (config.overlap == OverlapRule::kNearestInTime) {
+    votes.time_difference_ns.reserve(votes.index.size());
+    for (const std::uint32_t i : votes.index) {
+      votes.time_difference_ns.push_back(std::abs(cloud.stamp + toNs(cloud.dt[i]) - view.image_ns));
+    }
+  }
+
+  constexpr std::size_t kAhead = 16;  // enough to hide a trip to the memory
+  const std::size_t classes = static_cast<std::size_t>(config.class_count);
+  votes.probabilities.reserve(pixels.size() * classes);
+  std::vector<double> p(classes);
+  for (std::size_t k = 0; k < std::min(kAhead, pixels.size()); ++k) {
+    distribution.prefetch(pixels[k].column, pixels[k].row);
+  }
+  for (std::size_t k = 0; k < pixels.size(); ++k) {
+    if (k + kAhead < pixels.size()) {
+      distribution.prefetch(pixels[k + kAhead].column, pixels[k + kAhead].row);
+    }
+    if (!distribution.read(pixels[k].column, pixels[k].row, p.data())) ++report.nonfinite;
+    votes.probabilities.insert(votes.probabilities.end(), p.begin(), p.end());
+  }
 }
 
-/// Marks the points that would lie in the image of a camera that has none.
-void markWithoutImage(const Cloud& cloud, const CameraView& view,
-                      std::vector<std::uint8_t>* status) {
+/// The points that would lie in the image of a camera that has none.
+std::vector<std::uint32_t> pointsWithoutImage(const Cloud& cloud, const CameraView& view) {
   const CameraModel& model = *view.model;
   const ImageSize& size = model.imageSize();
   const EgoMask mask(view.ego_mask, size);
   const ProjectedPoints points = projectCloud(cloud, view.T_camera_lidar_static, model, 0.0);
+  std::vector<std::uint32_t> result;
   for (std::size_t k = 0; k < points.size(); ++k) {
     const double u = points.u[k], v = points.v[k];
     if (!inImage(u, v, size) || mask.hides(pixelIndex(u), pixelIndex(v))) continue;
-    improve(PointStatus::kNoImage, &(*status)[points.index[k]]);
+    result.push_back(points.index[k]);
   }
+  return result;
 }
 
 template <typename T>
@@ -309,9 +359,13 @@ void keepFused(SemanticCloud* cloud) {
 
 SemanticProjector::SemanticProjector(const FusionConfig& config) : config_(config) {
   checkConfig(config_);
+  pool_ = std::make_unique<ThreadPool>(config_.threads);
 }
 
-FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView> views) const {
+SemanticProjector::~SemanticProjector() = default;
+
+FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView> views,
+                                     bool with_pixels) const {
   std::sort(views.begin(), views.end(),
             [](const CameraView& a, const CameraView& b) { return a.name < b.name; });
   checkViews(views, config_.class_count);
@@ -334,27 +388,33 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
     grid = beamGrid(cloud, config_.occlusion);
   }
 
+  std::vector<CameraOutcome> outcomes(views.size());
+  pool_->forEach(static_cast<int>(views.size()), [&](int camera) {
+    const CameraView& view = views[static_cast<std::size_t>(camera)];
+    CameraOutcome& outcome = outcomes[static_cast<std::size_t>(camera)];
+    if (!view.model || cloud.empty()) return;
+    if (view.has_image) {
+      vote(cloud, view, config_, grid, with_pixels, &outcome);
+    } else {
+      outcome.would_see = pointsWithoutImage(cloud, view);
+    }
+  });
+
   std::vector<CameraVotes> votes;
   votes.reserve(views.size());
-  for (const CameraView& view : views) {
-    result.cameras.emplace_back();
-    CameraFusionReport& report = result.cameras.back();
-    report.name = view.name;
-    if (!view.model || cloud.empty()) continue;
-    if (!view.has_image) {
-      markWithoutImage(cloud, view, &status);
-      continue;
-    }
-    votes.push_back(vote(cloud, view, config_, grid, &report));
-    for (std::size_t k = 0; k < report.index.size(); ++k) {
-      improve(report.status[k], &status[report.index[k]]);
-    }
+  for (CameraOutcome& outcome : outcomes) {
+    for (const std::uint32_t i : outcome.hidden) improve(PointStatus::kOccluded, &status[i]);
+    for (const std::uint32_t i : outcome.would_see) improve(PointStatus::kNoImage, &status[i]);
+    votes.push_back(std::move(outcome.votes));
   }
+  mergeVotes(votes, config_.overlap, &result.cloud, pool_.get());
 
-  mergeVotes(votes, config_.overlap, &result.cloud);
-  for (CameraFusionReport& report : result.cameras) {
+  for (std::size_t k = 0; k < views.size(); ++k) {
+    CameraFusionReport& report = outcomes[k].report;
+    report.name = views[k].name;
     report.label.reserve(report.index.size());
     for (const std::uint32_t i : report.index) report.label.push_back(result.cloud.label[i]);
+    result.cameras.push_back(std::move(report));
   }
   if (!config_.keep_unlabelled) keepFused(&result.cloud);
   return result;

@@ -274,7 +274,9 @@ TimeDecision decide(const Field& field, const RawTimes& raw, double lowest, doub
   const bool wide =
       field.datatype == kFloat64 || field.datatype == kInt64 || field.datatype == kUint64;
 
-  // Absolute times: the unit in which they come nearest to the header stamp.
+  // Absolute times: the unit in which they come nearest to the header stamp. A unit that would make
+  // the scan longer than scans are is none: near time zero (simulation) 0..0.1 s in ns would pass
+  // for 0..100 s in us.
   if (decision.reference == TimeReference::kAbsolute ||
       (decision.reference == TimeReference::kAuto && wide)) {
     double best_distance = std::numeric_limits<double>::infinity();
@@ -283,6 +285,12 @@ TimeDecision decide(const Field& field, const RawTimes& raw, double lowest, doub
     for (const TimeUnit unit : {TimeUnit::kSeconds, TimeUnit::kMilliseconds,
                                 TimeUnit::kMicroseconds, TimeUnit::kNanoseconds}) {
       if (config.time_unit != TimeUnit::kAuto && config.time_unit != unit) continue;
+      const TimeUnit usual = raw.integer ? TimeUnit::kNanoseconds : TimeUnit::kSeconds;
+      const double span_ns = (highest - lowest) * static_cast<double>(nsOf(unit));
+      if (decision.reference == TimeReference::kAuto && config.time_unit == TimeUnit::kAuto &&
+          span_ns > static_cast<double>(unit == usual ? 10 * kNsPerSecond : kNsPerSecond)) {
+        continue;
+      }
       const double ns = middle * static_cast<double>(nsOf(unit));
       const double distance = std::abs(ns - static_cast<double>(header_stamp));
       if (distance < best_distance) {

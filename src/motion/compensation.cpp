@@ -206,7 +206,8 @@ Plan makePlan(const TimedCloud& scan, const PoseBuffer& odometry, bool reference
       ++plan.uncovered_count;
       plan.fates[k] = fateOfUncovered(begin, end, odometry, config);
     }
-    if (!reference_covered && plan.fates[k] == Fate::kMove) plan.fates[k] = Fate::kMark;
+    // Without the pose at t_ref no firing has one relative to it, whatever becomes of single ones.
+    if (!reference_covered) plan.fates[k] = Fate::kMark;
     if (plan.fates[k] != Fate::kMove) continue;
     plan.first_ns = std::min(plan.first_ns, begin);
     plan.last_ns = std::max(plan.last_ns, by_packet ? begin : end);

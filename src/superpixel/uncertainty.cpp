@@ -6,7 +6,9 @@
 #include <string>
 
 #include "score_kernels.h"
+#include "semantic_lidar_fusion/common/cell_grid.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "softmax_kernels.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -20,13 +22,6 @@ void checkClassCount(int class_count) {
     throw DataError("class count is " + std::to_string(class_count) + ", must be 1.." +
                     std::to_string(CV_CN_MAX));
   }
-}
-
-/// Cell of the source grid under each of `count` target positions along one axis.
-std::vector<int> cellsUnderCentres(int count, int source_count) {
-  std::vector<int> cells(count);
-  for (int i = 0; i < count; ++i) cells[i] = cellUnderCentre(i, count, source_count);
-  return cells;
 }
 
 /// Votes per superpixel and class, and their sums.
@@ -174,23 +169,13 @@ ShareMap computeShare(const SuperpixelMap& superpixels, const ScoreMap& scores) 
 bool temperedSoftmax(const float* scores, int class_count, double share,
                      const UncertaintyConfig& config, double* probabilities) {
   if (class_count < 1) return false;
-  bool valid = share > 0.0 && share <= 1.0;
-  for (int c = 0; c < class_count; ++c) valid = valid && std::isfinite(scores[c]);
-  if (!valid) {
-    fillUniform(class_count, probabilities);
-    return false;
+  static const SoftmaxKernels& kernels = softmaxKernels();
+  if (share > 0.0 && share <= 1.0 &&
+      kernels.softmax(scores, class_count, inverseTemperature(share, config), probabilities)) {
+    return true;
   }
-  const double inverse_tau = inverseTemperature(share, config);
-  const double highest = *std::max_element(scores, scores + class_count);
-  double sum = 0.0;
-  for (int c = 0; c < class_count; ++c) {
-    const double below = scores[c] - highest;
-    // The highest has exponent 0 whatever the temperature, also where 1 / tau overflows.
-    probabilities[c] = below == 0.0 ? 1.0 : std::exp(below * inverse_tau);
-    sum += probabilities[c];
-  }
-  for (int c = 0; c < class_count; ++c) probabilities[c] /= sum;
-  return true;
+  fillUniform(class_count, probabilities);
+  return false;
 }
 
 cv::Mat denseProbabilities(const ScoreMap& scores, const cv::Mat& share,

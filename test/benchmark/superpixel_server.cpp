@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: MIT
 /// Clusters images that come on standard input, for comparisons with libraries of other languages.
 ///
-/// Each request is a line "width height count mode" (mode: cold, or warm = start from the request
-/// before), then width * height * 3 bytes BGR. The answer is a line "CPU-milliseconds superpixels",
-/// then width * height 32-bit ids in the machine's byte order. Ends at the end of input.
+/// Each request is a line "width height count mode", then width * height * 3 bytes BGR. Modes:
+/// cold; warm = start from the request before with the same count; first = of a sequence whose next
+/// ones are warm. The answer is a line "CPU-milliseconds superpixels", then width * height 32-bit
+/// ids in the machine's byte order. Ends at the end of input.
 #include <time.h>
 
 #include <cstdio>
@@ -48,8 +49,9 @@ int main() {
       }
       SlicConfig config;
       config.count = count;
-      config.warm_start = mode == "warm";
+      config.warm_start = mode != "cold";
       Slic& slic = clusterers.try_emplace({count, config.warm_start}, config).first->second;
+      if (mode == "first") slic.reset();
       const double start = threadMilliseconds();
       const auto map = slic.cluster(image, {width, height});
       std::cout << threadMilliseconds() - start << " " << map.count << "\n";

@@ -12,7 +12,8 @@ So every test that CMake registered (expected_tests.txt) must have left
   * no trace of a crash, of a node that died or of a sanitizer's report, in CTest's log or in the
     logs of its nodes.
 
-A .test file that kills a node on purpose says so: <!-- gate: killed NODE SIGNAL_NUMBER -->
+A .test file that kills a node on purpose says so: <!-- gate: killed NODE SIGNAL_NUMBER -->; one that
+runs a launch file whose required node ends it when all is done: <!-- gate: ends NODE -->
 
 Prints what is wrong and, as its last line, `N passed, N failed`, where N counts test cases and
 each piece of bad evidence; exit code 0 only if nothing failed.
@@ -37,7 +38,6 @@ TRACES = [
         (r"stack smashing detected|buffer overflow detected", "memory corruption"),
         (r"Assertion .* failed", "failed assertion"),
         (r"Failed to load (nodelet|library)|Could not load library", "a plugin did not load"),
-        (r"REQUIRED process \[", "a required node ended"),
         (r"escalating to SIG(TERM|KILL)", "a node did not end when asked to"),
         (r"bad callback: ", "an exception in a callback of rospy"),
     ]
@@ -50,8 +50,10 @@ DIED = re.compile(
 ENDED = re.compile(
     r"process\[(?P<node>[^\]\s]+?)(-\d+)?\]: SIG\w+ killed with return value (?P<code>-?\d+)"
 )
+REQUIRED = re.compile(r"REQUIRED process \[(?P<node>[^\]\s]+?)(-\d+)?\] has died")
 CRASH_CODES = {-4, -6, -7, -8, -11, 66, 134, 139}
 ALLOWED = re.compile(r"<!--\s*gate:\s*killed\s+(\S+)\s+(\d+)\s*-->")
+ENDS = re.compile(r"<!--\s*gate:\s*ends\s+(\S+)\s*-->")
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -165,9 +167,15 @@ def read_result(report, path, log):
 def check_logs(report, logs, allowed):
     """Looks for traces of crashes in `logs` (list of (title, text)).
 
-    `allowed` is the set of (node, signal) that the test sends itself."""
+    `allowed` is the set of (node, signal) that the test sends itself, with signal 0 for a required
+    node that ends its launch."""
     for title, text in logs:
         for line in COLOUR.sub("", text).splitlines():
+            required = REQUIRED.search(line)
+            if required:
+                if (required.group("node"), 0) not in allowed:
+                    report.fail("%s: a required node ended: %s" % (title, line.strip()[:200]))
+                continue
             died = DIED.search(line)
             if died:
                 code = int(died.group("code") or 0)
@@ -188,6 +196,7 @@ def rostest_names(report, test_file):
     """Test names of the .test file and the kills that it announces."""
     text = read_text(test_file)
     allowed = {(node, int(signal)) for node, signal in ALLOWED.findall(text)}
+    allowed |= {(node, 0) for node in ENDS.findall(text)}
     try:
         root = ET.fromstring(text)
     except ET.ParseError as error:

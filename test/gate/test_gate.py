@@ -169,6 +169,14 @@ def test_announced_kill_is_no_failure_but_another_signal_is(build, capsys):
     assert build.judge(capsys)[0] == 1
 
 
+def test_announced_end_of_a_launch_is_no_failure_but_another_nodes_is(build, capsys):
+    text = ROSTEST + "<!-- gate: ends finish -->"
+    build.add_rostest(text=text, output="REQUIRED process [finish-8] has died!")
+    assert build.judge(capsys)[:2] == (0, "1 passed, 0 failed")
+    build.log = section("ros", "REQUIRED process [manager-2] has died!")
+    assert build.judge(capsys)[0] == 1
+
+
 def test_two_files_with_one_test_name_fail(build, capsys):
     build.add_rostest(name="one").add_rostest(name="two")
     code, _, out = build.judge(capsys)

@@ -29,6 +29,7 @@ ROOMS = {
         "fusion",
         "segmentation",
         "overlay",
+        "map",
     },
     "superpixel": {"lidar", "motion", "camera", "projection", "fusion"},
     "lidar": {"superpixel", "motion", "camera", "projection", "fusion"},
@@ -36,6 +37,7 @@ ROOMS = {
     "camera": {"superpixel", "lidar", "motion", "projection", "fusion"},
     "sync": {"superpixel", "lidar", "motion", "camera", "projection", "fusion"},
     "projection": {"superpixel", "motion", "fusion"},
+    "map": {"superpixel", "lidar", "motion", "camera", "sync", "projection", "fusion"},
 }
 
 

@@ -83,10 +83,36 @@ def test_launch_files_load_with_every_argument_documented(path):
     for name, argument in arguments.items():
         assert argument.get("doc") or argument.get("value") is not None, "%s: no doc" % name
     wanted = [a for a in ARGUMENTS if a.split(":=")[0] in arguments]
-    assert "/" in roslaunch("--nodes", path, "bond:=true", *wanted)
-    parameters = yaml.safe_load(roslaunch("--dump-params", path, "bond:=false", *wanted))
+    bonds = {"true": [], "false": []}
+    if "bond" in arguments:
+        bonds = {value: ["bond:=" + value] for value in bonds}
+    assert "/" in roslaunch("--nodes", path, *bonds["true"] + wanted)
+    parameters = yaml.safe_load(roslaunch("--dump-params", path, *bonds["false"] + wanted)) or {}
     rigs = {value for key, value in parameters.items() if key.endswith("/rig_file")}
+    if "rig" not in arguments:
+        assert not rigs
+        return
     assert rigs and {os.path.basename(rig) for rig in rigs} == {"kitti.yaml"}
+
+
+def test_rviz_shows_topics_that_the_chain_publishes():
+    """Topics of its configuration stand in the launch file, which joins them to the chain's."""
+    config = yaml.load(
+        text_of(os.path.join(SOURCE_DIR, "launch", "fusion.rviz")), Loader=UniqueKeys
+    )
+    displays = config["Visualization Manager"]["Displays"]
+    shown = {d.get("Topic") or d.get("Image Topic") for d in displays} - {None}
+    launch = ET.parse(os.path.join(SOURCE_DIR, "launch", "rviz.launch"))
+    remaps = {r.get("from"): r.get("to") for r in launch.iter("remap")}
+    assert shown == set(remaps)
+    nodelets = "".join(text_of(path) for path in files("nodelets/*_nodelet.cpp"))
+    for name in remaps.values():
+        assert '"%s"' % name.split("/")[-1] in nodelets, name
+    channels = {d["Channel Name"] for d in displays if "Channel Name" in d}
+    assert channels == {"p_road"}
+    for name in ("usyd12", "cityscapes", "camvid12"):
+        classes = yaml.safe_load(text_of(os.path.join(SOURCE_DIR, "config/classes_%s.yaml" % name)))
+        assert "road" in [c["name"] for c in classes["classes"]]
 
 
 @pytest.mark.skipif(not shutil.which("roslaunch"), reason="roslaunch is not installed")
@@ -123,6 +149,20 @@ def test_plugin_descriptions_match_the_exports():
     for path in files("nodelets/*.cpp"):
         exported += macro.findall(text_of(path))
     assert sorted(described) == sorted(exported)
+
+
+def test_subscriptions_do_not_wait_for_nagle():
+    """All subscriptions are made in two places, both with tcpNoDelay."""
+    places = set()
+    for path in files("nodelets/*.h") + files("nodelets/*.cpp"):
+        text = text_of(path)
+        found = len(re.findall(r"\bhandle\.subscribe<|NodeHandle\(\)\.subscribe<", text))
+        if found:
+            places.add(os.path.basename(path))
+            assert "ros::TransportHints().tcpNoDelay()" in text
+            hinted = len(re.findall(r"ros::VoidConstPtr\(\),\s*(hints|ros::TransportHints)", text))
+            assert hinted == found, path
+    assert places == {"fusion_nodelet.h", "tf_subscription.h"}
 
 
 def test_rostests_cannot_pass_by_default():

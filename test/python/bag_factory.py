@@ -120,7 +120,7 @@ class Drive:
     yaw_rate: float = 0.5
     origin: Tuple[float, float] = (0.0, 0.0)  # of the room in the fixed frame
     points_per_scan: int = 4000
-    image_transport: str = "raw"
+    image_transport: str = "raw"  # or "compressed" (PNG), "jpeg"
     semantics: str = "scores"  # or "labels", "probabilities", "none"
     odometry: str = "tf"  # or "topic", "none"
     odometry_until_s: Optional[float] = None  # no odometry later than this
@@ -409,14 +409,15 @@ def write_bag(path: str, drive: Drive) -> None:
             noise = random.randint(-6, 7, labels.shape + (3,))
             colors = np.array(CLASS_COLORS)[labels][..., ::-1]  # BGR
             pixels = np.clip(colors + noise, 0, 255).astype(np.uint8)
-            if drive.image_transport == "compressed":
+            if drive.image_transport != "raw":
                 import cv2
 
                 compressed = CompressedImage()
                 compressed.header.stamp = stamp(time_ns)
                 compressed.header.frame_id = camera.name
-                compressed.format = "bgr8; png compressed bgr8"
-                compressed.data = cv2.imencode(".png", pixels)[1].tobytes()
+                kind = "jpeg" if drive.image_transport == "jpeg" else "png"
+                compressed.format = "bgr8; %s compressed bgr8" % kind
+                compressed.data = cv2.imencode("." + kind, pixels)[1].tobytes()
                 messages.append((time_ns, "/%s/image/compressed" % camera.name, compressed))
             else:
                 image = image_message(pixels, "bgr8", time_ns, camera.name)
@@ -474,7 +475,7 @@ def rig_text(drive: Drive, extra: str = "") -> str:
         lines.append("    namespace: /%s" % camera.name)
         if camera.clock_ahead_ns:
             lines.append("    time_offset: %.9f" % (-1e-9 * camera.clock_ahead_ns))
-        if drive.image_transport == "compressed":
+        if drive.image_transport != "raw":
             lines.append("    transport: compressed")
         if drive.semantics in ("labels", "probabilities"):
             lines.append("    input: %s" % drive.semantics)

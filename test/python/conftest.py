@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Makes the package below scripts/ importable, and finds optional data."""
 
+import glob
 import importlib.util
 import os
 import sys
@@ -10,6 +11,11 @@ import pytest
 SOURCE_DIR = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))
 sys.path.insert(0, os.path.join(SOURCE_DIR, "scripts"))
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+# The compiled module of this build.
+if os.environ.get("SLF_BIN_DIR"):
+    sys.path += glob.glob(
+        os.path.join(os.environ["SLF_BIN_DIR"], "..", "python3*", "dist-packages")
+    )
 
 
 @pytest.fixture

@@ -319,6 +319,15 @@ def test_dense_probabilities_equal_those_of_the_points(room):
     assert np.abs(ours - dense[row, column]).max() < 1e-6
 
 
+def test_clamped_superpixel_count_and_time_field_are_said_once(room, fused):
+    # 120 x 90 score cells / 64 = 168, of 200 wanted
+    assert fused.result.stderr.count("superpixels.count = 200") == 1
+    assert "168" in fused.result.stderr
+    assert fused.result.stdout.count("field 't' (uint32) in ns after the header stamp") == 1
+    enough = room.fuse("--set", "superpixels.count=168", name="enough.bag")
+    assert "superpixels.count" not in enough.result.stderr
+
+
 def test_set_overrides_the_rig_file(room):
     kept = room.fuse("--set", "keep_unlabelled=false", name="kept.bag")
     for cloud in kept.clouds():
@@ -720,6 +729,25 @@ def test_output_that_exists(room, tmp_path):
     assert result.returncode == 0
     assert (result.stdout, result.stderr) == ("", "")
     rosbag.Bag(str(out)).close()
+
+
+def test_earlier_output_is_replaced_and_no_other_bag(room, tmp_path):
+    out = tmp_path / "out.bag"
+    out.write_bytes(b"")
+    digests = set()
+    for _ in range(2):
+        result = run(room.bag, out, "--rig", room.rig)
+        assert result.returncode == 0, result.stderr
+        digests.add(digest(out))
+    assert len(digests) == 1
+    # A failure leaves it as it was.
+    (tmp_path / "bad.bag").write_bytes(room.bag.read_bytes()[:5000])
+    assert_fails(run(tmp_path / "bad.bag", out, "--rig", room.rig), "bad.bag")
+    assert {digest(out)} == digests
+    recording = tmp_path / "recording.bag"
+    recording.write_bytes(room.bag.read_bytes())
+    assert_fails(run(out, recording, "--rig", room.rig), "recording.bag", "--force")
+    assert digest(recording) == digest(room.bag)
 
 
 def test_output_is_the_input(room, tmp_path):

@@ -300,6 +300,7 @@ def test_wrong_command_lines_are_named(tmp_path):
         (["--speed", "50"], ["--speed", "'50'", "5 to 15"]),
         (["--duration", "x"], ["--duration", "'x'"]),
         (["--images", "some"], ["--images", "'some'"]),
+        (["--image-choice", "best"], ["--image-choice", "'best'", "closest_to_sweep"]),
         (["--nonsense"], ["--nonsense"]),
         (["--seed"], ["--seed", "value"]),
     ):

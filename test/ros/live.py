@@ -4,6 +4,7 @@
 Every wait is for a condition and bounded; nothing here sleeps for a fixed time to be in step.
 """
 import contextlib
+import copy
 import hashlib
 import os
 import re
@@ -14,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+import unittest
 import xmlrpc.client
 
 import genpy
@@ -23,6 +25,7 @@ import rosgraph
 import rospy
 from diagnostic_msgs.msg import DiagnosticArray
 from rosgraph_msgs.msg import Log
+from sensor_msgs.msg import Image, PointCloud2
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SOURCE_DIR = os.path.dirname(os.path.dirname(HERE))
@@ -44,6 +47,15 @@ class SetBool:
     _md5sum = "09fb03525b03e7ea1fd3992bafd87e16"
     _request_class = _dynamic("std_srvs/SetBoolRequest", "bool data\n")
     _response_class = _dynamic("std_srvs/SetBoolResponse", "bool success\nstring message\n")
+
+
+# bond/Status, whose Python package need not be installed.
+BOND_STATUS = _dynamic(
+    "bond/Status",
+    "Header header\nstring id\nstring instance_id\nbool active\nfloat32 heartbeat_timeout\n"
+    "float32 heartbeat_period\n" + "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\n"
+    "string frame_id\n",
+)
 
 
 def wait_until(condition, what, timeout=30.0):
@@ -73,7 +85,9 @@ def _stop(process, timeout=20.0):
 
 @contextlib.contextmanager
 def launched(name, **arguments):
-    """A launch file of the package as long as the block runs."""
+    """A launch file of the package as long as the block runs; a sanitizer reaches its manager."""
+    if os.environ.get("SLF_LAUNCH_PREFIX"):
+        arguments.setdefault("launch_prefix", os.environ["SLF_LAUNCH_PREFIX"])
     command = ["roslaunch", "--skip-log-check", os.path.join(SOURCE_DIR, "launch", name)]
     command += ["%s:=%s" % item for item in arguments.items()]
     process = subprocess.Popen(command)
@@ -96,10 +110,10 @@ def folder():
 class Made:
     """A bag of a drive with its rig file, and what fuse_bag makes of it."""
 
-    def __init__(self, path, drive, rig_extra=""):
+    def __init__(self, path, drive, rig_extra="", name="in"):
         self.drive = drive
-        self.bag = os.path.join(path, "in.bag")
-        self.rig = os.path.join(path, "rig.yaml")
+        self.bag = os.path.join(path, name + ".bag")
+        self.rig = os.path.join(path, name + ".yaml")
         bag_factory.write_bag(self.bag, drive)
         with open(self.rig, "w") as file:
             file.write(bag_factory.rig_text(drive, rig_extra))
@@ -248,6 +262,162 @@ def difference(a, b):
     return "data differs: " + (", ".join(parts) or "padding")
 
 
+class Feed:
+    """Publishes a drive again and again on the wall clock, at stamps that no other pass has used:
+    each pass is a jump of time, so that each starts anew."""
+
+    SHIFT_S = 20
+
+    def __init__(self, made):
+        self._messages = made.messages()
+        types = {topic: type(message) for _, topic, message in self._messages}
+        self.topics = set(types)
+        self.publishers = {
+            topic: rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
+            for topic, kind in types.items()
+        }
+        self._passes = 0
+
+    def next_drive(self):
+        """The drive's messages at the stamps of the next pass: (topic, message)."""
+        self._passes += 1
+        result = []
+        for _, topic, original in self._messages:
+            message = copy.deepcopy(original)
+            for stamped in getattr(message, "transforms", [message]):
+                stamped.header.stamp.secs += self._passes * self.SHIFT_S
+            for packet in getattr(message, "packets", []):
+                packet.stamp.secs += self._passes * self.SHIFT_S
+            result.append((topic, message))
+        return result
+
+    def publish(self, messages, change=None):
+        """Publishes; `change(topic, message)` gives what goes out instead, None for nothing."""
+        for topic, message in messages:
+            message = message if change is None else change(topic, message)
+            if message is not None:
+                self.publishers[topic].publish(message)
+                rospy.rostime.wallsleep(0.003)  # the pace of a drive; no step waits for it
+
+    def close(self):
+        for publisher in self.publishers.values():
+            publisher.unregister()
+
+
+class Network:
+    """A segmentation node of somebody else: answers each image with the scores of its stamp, in
+    order, `latency_s` (wall time) after it came."""
+
+    def __init__(self, answers, images, latency_s):
+        """`answers`: camera -> {stamp in ns: message}; `images`: topic of images, with %s for the
+        camera."""
+        self.latency_s = latency_s
+        self.asked = {camera: [] for camera in answers}
+        self._answers = answers
+        self._publishers = {
+            camera: rospy.Publisher("/%s/scores" % camera, Image, queue_size=100)
+            for camera in answers
+        }
+        self._subscribers = [
+            rospy.Subscriber(images % camera, Image, self._answer, camera, buff_size=1 << 24)
+            for camera in answers
+        ]
+
+    def _answer(self, image, camera):
+        stamp = image.header.stamp.to_nsec()
+        self.asked[camera].append(stamp)
+        scores = self._answers[camera][stamp]
+        threading.Timer(self.latency_s, self._publishers[camera].publish, [scores]).start()
+
+    def wait_until_connected(self):
+        def is_connected():
+            ends = list(self._publishers.values()) + self._subscribers
+            return all(end.get_num_connections() for end in ends)
+
+        wait_until(is_connected, "the network's neighbours")
+
+    def close(self):
+        for end in list(self._publishers.values()) + self._subscribers:
+            end.unregister()
+
+
+# Slower than real time: what counts is the result, not whether the machine keeps up.
+RATE = 0.25
+
+
+def cameras():
+    """Different phases and rates."""
+    return [
+        bag_factory.Camera("front", 0.0, (1.5, 0.1, 0.2), width=240, height=180, focal=85.0),
+        bag_factory.Camera(
+            "left",
+            1.5707963,
+            (0.8, 0.6, 0.1),
+            phase_ns=7_000_000,
+            period_ns=33_000_000,
+            width=240,
+            height=180,
+            focal=85.0,
+        ),
+    ]
+
+
+def patience(names=("front", "left")):
+    """Overrides with which nothing is late on a busy machine: all decisions are the stamps'."""
+    return ["cameras.%s.timeout=20" % name for name in names] + ["odometry.timeout=20"]
+
+
+class ReplayCase(unittest.TestCase):
+    """What is played through replay.launch is compared with what fuse_bag makes of a bag."""
+
+    def assert_same(self, expected, received):
+        """`expected`: clouds by stamp (ns); `received`: messages."""
+        self.assertEqual(sorted(expected), sorted(m.header.stamp.to_nsec() for m in received))
+        for message in received:
+            offline = expected[message.header.stamp.to_nsec()]
+            self.assertEqual(difference(message, offline), "")
+
+    def assert_replay_gives(
+        self,
+        expected,
+        bag,
+        rig,
+        overrides,
+        topics,
+        rate=RATE,
+        network=None,
+        before_the_end=lambda: None,
+        **arguments,
+    ):
+        """Plays `bag` when all of `topics` have listeners and the external network, if there is
+        one, is connected. Returns the clouds that came. `before_the_end` is called before the
+        nodes end."""
+        semantic = Received("/points_semantic", PointCloud2)
+        try:
+            with launched(
+                "replay.launch",
+                bag=bag,
+                rig=rig,
+                paused="true",
+                rate=rate,
+                delay=0,
+                overrides=" ".join(overrides),
+                **arguments,
+            ):
+                wait_for_chain(topics, "/player")
+                if network is not None:
+                    network.wait_until_connected()
+                resume()
+                received = semantic.wait_for(len(expected), timeout=60.0)
+                before_the_end()
+        finally:
+            semantic.close()
+        self.assert_same(expected, received)
+        fused = sum((bag_factory.read_cloud(m)["status"] == 0).sum() for m in received)
+        self.assertGreater(fused, 1000)
+        return received
+
+
 def digest(data):
     return hashlib.sha1(bytes(data)).hexdigest()
 
@@ -300,6 +470,6 @@ class Said:
             lines = list(self._lines)
         return [line for line in lines if line[0] >= level and re.search(pattern, line[2])]
 
-    def wait_for(self, pattern, level=Log.WARN, timeout=20.0):
+    def wait_for(self, pattern, level=Log.WARN, timeout=60.0):
         with_text = lambda: "a line like '%s'; said: %s" % (pattern, self._lines)  # noqa: E731
         return wait_until(lambda: self.find(pattern, level), with_text, timeout)

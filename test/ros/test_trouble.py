@@ -4,21 +4,23 @@
 
 One manager serves all cases, in the order of their names; its process id must not change.
 """
-import copy
+import json
 import os
 import sys
 import unittest
 
 import rospy
 import rostest
+import yaml
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 import live  # noqa: E402
-from bag_factory import Drive, read_cloud  # noqa: E402
+from bag_factory import CLASS_NAMES, Drive, read_cloud  # noqa: E402
 from rosgraph_msgs.msg import Log  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
 
-SHIFT_NS = 20 * 10**9  # between the stamps of two cases: a jump, so that each starts anew
+NODELETS = ("image_selection", "superpixel_uncertainty", "motion_compensation", "projection")
 
 
 class Trouble(unittest.TestCase):
@@ -32,13 +34,8 @@ class Trouble(unittest.TestCase):
         cls.folder = cls.context.__enter__()
         cls.drive = Drive(scans=2, points_per_scan=1600)
         cls.made = live.Made(cls.folder, cls.drive)
-        cls.messages = cls.made.messages()
         cls.expected = cls.made.fused()
-        types = {topic: type(message) for _, topic, message in cls.messages}
-        cls.publishers = {
-            topic: rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
-            for topic, kind in types.items()
-        }
+        cls.feed = live.Feed(cls.made)
         cls.semantic = live.Received("/points_semantic", PointCloud2)
         # Patient with a machine that is busy, and still far shorter than the test.
         overrides = ["%s.timeout=3" % key for key in ("cameras.front", "cameras.left", "odometry")]
@@ -47,9 +44,8 @@ class Trouble(unittest.TestCase):
             "fusion.launch", rig=cls.made.rig, bond="false", overrides=cls.overrides
         )
         cls.launch.__enter__()
-        live.wait_for_chain(types, rospy.get_name())
+        live.wait_for_chain(cls.feed.topics, rospy.get_name())
         cls.pid = live.pid_of(live.MANAGER)
-        cls.case = 0
 
     @classmethod
     def tearDownClass(cls):
@@ -59,36 +55,15 @@ class Trouble(unittest.TestCase):
     def tearDown(self):
         self.assertEqual(live.pid_of(live.MANAGER), self.pid, "the manager has died")
 
-    def shifted(self):
-        """The drive's messages at stamps that no other case has used: (topic, message)."""
-        type(self).case += 1
-        shift = rospy.Duration.from_sec(0)
-        shift.secs = self.case * SHIFT_NS // 10**9
-        result = []
-        for _, topic, original in self.messages:
-            message = copy.deepcopy(original)
-            for stamped in getattr(message, "transforms", [message]):
-                stamped.header.stamp += shift
-            result.append((topic, message))
-        return result
-
-    def publish(self, messages, change=None):
-        """Publishes; `change(topic, message)` gives what goes out instead, None for nothing."""
-        for topic, message in messages:
-            message = message if change is None else change(topic, message)
-            if message is not None:
-                self.publishers[topic].publish(message)
-                rospy.rostime.wallsleep(0.003)  # the pace of a drive; no step waits for it
-
     def run_drive(self, change=None, scans=2):
         self.semantic.clear()
-        self.publish(self.shifted(), change)
+        self.feed.publish(self.feed.next_drive(), change)
         return [read_cloud(m) for m in self.semantic.wait_for(scans)[:scans]]
 
     def assert_good(self):
         """An unchanged drive gives what fuse_bag gives."""
         self.semantic.clear()
-        self.publish(self.shifted())
+        self.feed.publish(self.feed.next_drive())
         received = self.semantic.wait_for(2)
         self.assertEqual(len(received), len(self.expected))
         for message, stamp in zip(received, sorted(self.expected)):
@@ -213,14 +188,24 @@ class Trouble(unittest.TestCase):
         self.assert_good()
 
     def test_10_every_nodelet_reports(self):
-        names = ("image_selection", "superpixel_uncertainty", "motion_compensation", "projection")
         live.wait_until(
             lambda: all(
                 any("rate (Hz)" in key for key in self.diagnostics.values.get(name, ()))
-                for name in names
+                for name in NODELETS
             ),
-            lambda: "diagnostics of %s; came: %s" % (names, sorted(self.diagnostics.values)),
+            lambda: "diagnostics of %s; came: %s" % (NODELETS, sorted(self.diagnostics.values)),
         )
+
+    def test_11_what_is_latched_comes_to_those_who_ask_late(self):
+        info = json.loads(rospy.wait_for_message("/class_info", String, 20.0).data)
+        self.assertEqual([c["name"] for c in info["classes"]], list(CLASS_NAMES))
+        for nodelet in NODELETS:
+            text = rospy.wait_for_message("/%s/configuration" % nodelet, String, 20.0).data
+            known = yaml.safe_load(text)
+            self.assertRegex(known["version"], r"^\d+\.\d+\.\d+$")
+            self.assertEqual(known["name"], "room")
+            # Of an override, not of the file.
+            self.assertEqual(float(known["reference"]["timeout"]), 3.0)
 
 
 if __name__ == "__main__":

@@ -65,6 +65,8 @@ class CameraModel {
   std::optional<Eigen::Vector3d> ray(const Eigen::Vector2d& pixel) const;
   /// Angle between a point, seen from opticalCentre(), and the optical axis of the image, rad.
   double theta(const Eigen::Vector3d& p_camera) const;
+  /// No point at a larger angle has a pixel within `margin_px` of the image; at most maxThetaRad().
+  double maxThetaWithin(double margin_px) const;
   /// Where the rays start, in the camera's frame, m: zero unless P has a fourth column.
   const Eigen::Vector3d& opticalCentre() const { return optical_centre_; }
 

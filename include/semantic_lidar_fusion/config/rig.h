@@ -99,8 +99,9 @@ struct SegmentationConfig {
 };
 
 struct Rig {
-  std::string name;                   ///< default: the rig file's, without extension
-  LabelSet classes;                   ///< key `classes`: {file: PATH}, a path or a set in place
+  std::string yaml;  ///< what it was read from, overrides applied; keys left out have their default
+  std::string name;  ///< default: the rig file's, without extension
+  LabelSet classes;  ///< key `classes`: {file: PATH}, a path or a set in place
   std::vector<CameraConfig> cameras;  ///< at most 16; the position is the bit in `cameras`
   LidarConfig lidar;
   std::string fixed_frame = "odom";
@@ -116,6 +117,7 @@ struct Rig {
   OcclusionConfig occlusion;
   OverlapRule overlap = OverlapRule::kMean;
   bool keep_unlabelled = true;
+  int threads = 1;  ///< that share the cameras of a scan; results do not depend on it
 
   /// Index of the reference camera; -1 without cameras.
   int referenceCamera() const;

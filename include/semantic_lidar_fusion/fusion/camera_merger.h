@@ -9,6 +9,8 @@
 
 namespace semantic_lidar_fusion {
 
+class ThreadPool;
+
 enum class OverlapRule : std::uint8_t {
   kMean,           ///< arithmetic mean of the distributions
   kProduct,        ///< normalised product; independent evidence
@@ -21,7 +23,8 @@ struct CameraVotes {
   int rig_index = 0;
   std::vector<std::uint32_t> index;              ///< into the cloud, strictly ascending
   std::vector<double> probabilities;             ///< index.size() x class_count, row-major
-  std::vector<std::int64_t> time_difference_ns;  ///< |t_point - t_image|
+  std::vector<std::int64_t> time_difference_ns;  ///< |t_point - t_image|; may be empty unless the
+                                                 ///< rule is kNearestInTime
   std::vector<float> theta;                      ///< rad
 };
 
@@ -35,7 +38,8 @@ struct CameraVotes {
 /// The label is the most likely class as published (float), the lowest id on ties; confidence is
 /// its probability, entropy H / ln(class_count) (0 for one class); `cameras` holds the bits of the
 /// cameras whose votes were used. Throws DataError if arrays of `votes` do not fit each other or
-/// the cloud.
-void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, SemanticCloud* cloud);
+/// the cloud. The points are shared out among the threads of `pool`, if there is one.
+void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, SemanticCloud* cloud,
+                ThreadPool* pool = nullptr);
 
 }  // namespace semantic_lidar_fusion

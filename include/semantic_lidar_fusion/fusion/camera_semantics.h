@@ -4,6 +4,7 @@
 
 #include <opencv2/core.hpp>
 #include <optional>
+#include <string>
 
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/superpixel/slic.h"
@@ -20,6 +21,8 @@ class CameraSemantics {
   /// Size of the superpixel map of an image: floor(image * scale), at least 1 x 1; without a scale
   /// the size of the scores, which is empty until scores were seen.
   std::optional<ImageSize> mapSize(const ImageSize& image) const;
+  /// What to tell a user if a map of this size cannot hold `superpixels.count`; empty if it can.
+  std::string clampNote(const ImageSize& map_size) const;
   /// Tells the size of the scores, for maps of their size. An empty image is ignored.
   void noteScores(const cv::Mat& scores);
 

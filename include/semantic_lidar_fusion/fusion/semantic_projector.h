@@ -16,6 +16,8 @@
 
 namespace semantic_lidar_fusion {
 
+class ThreadPool;
+
 /// The semantics of one image: either scores with their share, or probabilities (also those of
 /// label images, see histogramProbabilities). Any resolution: image pixel -> superpixel pixel q ->
 /// score cell under q's centre.
@@ -45,9 +47,11 @@ struct FusionConfig {
   OcclusionConfig occlusion;
   OverlapRule overlap = OverlapRule::kMean;
   bool keep_unlabelled = true;  ///< false: only fused points come out, as in the paper
+  int threads = 1;              ///< that share the cameras, the caller's included
 };
 
-/// Where the points of one camera went; for overlays and diagnostics. Empty without an image.
+/// Where the points of one camera went; for overlays and diagnostics. Empty without an image; the
+/// arrays also if they were not asked for.
 struct CameraFusionReport {
   std::string name;
   std::vector<std::uint32_t> index;  ///< into the input cloud: the points within the image
@@ -68,18 +72,23 @@ class SemanticProjector {
  public:
   /// Throws ConfigError with every problem.
   explicit SemanticProjector(const FusionConfig& config);
+  ~SemanticProjector();
 
   /// The status of a point is the best any camera gives it, 0 before 1 before 3 before 2. A camera
   /// with an image gives 0 (visible), 1 (hidden) or 2 (not in the image, or on a masked pixel, even
   /// if hidden); one without an image gives 3 where its static extrinsics put the point on a pixel
   /// that is not masked; one without a model gives 2. Points with status kNoOdometry keep it.
   ///
-  /// The order of `views` does not matter. Throws DataError if names or rig indices repeat, if a
-  /// view's scores, share, probabilities or mask do not fit the configuration, or as beamGrid does.
-  FusionResult fuse(const Cloud& cloud, std::vector<CameraView> views) const;
+  /// The order of `views` does not matter, nor does the number of threads. `with_pixels`: fill the
+  /// arrays of the reports, which cost more than the rest of the transfer. Throws DataError if
+  /// names or rig indices repeat, if a view's scores, share, probabilities or mask do not fit the
+  /// configuration, or as beamGrid does.
+  FusionResult fuse(const Cloud& cloud, std::vector<CameraView> views,
+                    bool with_pixels = true) const;
 
  private:
   FusionConfig config_;
+  std::unique_ptr<ThreadPool> pool_;
 };
 
 }  // namespace semantic_lidar_fusion

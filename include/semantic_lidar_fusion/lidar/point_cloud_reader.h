@@ -9,7 +9,8 @@
 ///   coarsest
 ///     of ms, us, ns that makes it one second at most;
 ///   - 64-bit floats and integers are absolute if in some unit they lie within a day of the header
-///     stamp (and nearer to it than to zero), else relative: floats as above, integers in ns;
+///     stamp (and nearer to it than to zero, and the scan no longer than a second; ten in their
+///     usual unit, s or ns), else relative: floats as above, integers in ns;
 ///   - 64-bit integers, for which PointField has no type, are pairs of u32 (lower half first),
 ///   PCL's
 ///     types 9 and 10, or f64 fields whose values make sense as integers only;

@@ -70,6 +70,7 @@ TEST(RigTest, EmptyRigHasTheDefaultsOfTheStructs) {
   EXPECT_EQ(rig.lidar.without_time, WithoutTime::kInstant);
   EXPECT_EQ(rig.overlap, OverlapRule::kMean);
   EXPECT_TRUE(rig.keep_unlabelled);
+  EXPECT_EQ(rig.threads, 1);
   EXPECT_EQ(CameraConfig().max_time_difference_s, 0.05);
 }
 
@@ -117,6 +118,7 @@ occlusion: {mode: paper, vertical_step_deg: 2, horizontal_step_deg: 0.1, depth_m
             depth_margin_ratio: 0.2}
 overlap: most_central
 keep_unlabelled: false
+threads: 3
 )");
   EXPECT_EQ(rig.name, "vehicle");
   EXPECT_EQ(rig.classes.size(), 1);
@@ -181,6 +183,7 @@ keep_unlabelled: false
   EXPECT_EQ(rig.occlusion.depth_margin_ratio, 0.2);
   EXPECT_EQ(rig.overlap, OverlapRule::kMostCentral);
   EXPECT_FALSE(rig.keep_unlabelled);
+  EXPECT_EQ(rig.threads, 3);
 
   const CompensationConfig compensation = rig.compensationConfig();
   EXPECT_FALSE(compensation.enabled);
@@ -220,6 +223,17 @@ TEST(RigTest, ClassesMayBeAPathAFileKeyOrInPlace) {
   EXPECT_EQ(parse("classes: [{name: a, color: [0, 0, 0]}]").classes.size(), 1);
 }
 
+TEST(RigTest, KnowsTheLidarsByTheirMakersNamesToo) {
+  const std::pair<const char*, LidarModel> names[] = {
+      {"VLP16", LidarModel::kVlp16},           {"VLP-16", LidarModel::kVlp16},
+      {"Puck LITE", LidarModel::kVlp16},       {"PuckHiRes", LidarModel::kPuckHiRes},
+      {"Puck Hi-Res", LidarModel::kPuckHiRes}, {"Hi-Res", LidarModel::kPuckHiRes},
+      {"VLP-32C", LidarModel::kVlp32c},        {"HDL-32E", LidarModel::kHdl32e}};
+  for (const auto& [name, model] : names) {
+    EXPECT_EQ(parse("lidar: {model: " + std::string(name) + "}").lidar.model, model) << name;
+  }
+}
+
 struct BadCase {
   const char* text;
   const char* problem;  ///< the start of the one problem
@@ -242,6 +256,7 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
             "nearest_in_time, most_central"},
            {"overlap: [mean]", "rig.yaml: overlap = (a list of 1): must be one of mean"},
            {"keep_unlabelled: maybe", "rig.yaml: keep_unlabelled = maybe: must be true or false"},
+           {"threads: 0", "rig.yaml: threads = 0: must be a whole number from 1 to 64"},
            {"keep_unlabelled: 1", "rig.yaml: keep_unlabelled = 1: must be true or false"},
            {"fixed_frame: ''", "rig.yaml: fixed_frame = '': must be a tf frame"},
            {"fixed_frame: a b", "rig.yaml: fixed_frame = a b: must be a tf frame"},
@@ -257,6 +272,7 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
            {"superpixels: {compactness: 0}", "rig.yaml: superpixels.compactness = 0: must be"},
            {"superpixels: {compactness: .nan}", "rig.yaml: superpixels.compactness = .nan: must"},
            {"superpixels: {iterations: 0}", "rig.yaml: superpixels.iterations = 0: must be"},
+           {"superpixels: {iterations: 101}", "rig.yaml: superpixels.iterations = 101: must be"},
            {"superpixels: {scale: -1}",
             "rig.yaml: superpixels.scale = -1: must be a number from "
             "0 to 4"},
@@ -321,7 +337,8 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
            {"lidar: {frame: 1, frame: 2}", "rig.yaml: lidar.frame = 2: the key is given twice"},
            {"cameras: 5", "rig.yaml: cameras = 5: must be a list of cameras"},
            {"cameras: [{name: A0}]", "rig.yaml: classes = (missing): must be"},
-           {"classes: none.yaml", "none.yaml: cannot be read"},
+           {"classes: none.yaml", "rig.yaml: classes = none.yaml: must be a readable file; '"},
+           {"classes: {file: none.yaml}", "rig.yaml: classes.file = none.yaml: must be a readable"},
            {"classes: {file: [a]}", "rig.yaml: classes.file = (a list of 1): must be a text"},
            {"classes: {file: classes_usyd12.yaml, classes: []}",
             "rig.yaml: classes.classes = (a list of 0): unknown key"},
@@ -426,6 +443,17 @@ TEST(OverrideTest, LeavesTheCallersTreeAndAliasesAlone) {
   EXPECT_EQ(rigFromYaml(tree, kConfigFolder, "r", {"cameras.a.timeout=0.5"}).cameras[0].timeout_s,
             0.5);
   EXPECT_EQ(rigFromYaml(tree, kConfigFolder, "r").cameras[0].timeout_s, 0.1);
+}
+
+TEST(OverrideTest, IsInTheTreeThatTheRigKeeps) {
+  const Rig rig = parse(kTwoCameras, {"cameras.right.timeout=0.75", "overlap=product"});
+  const YAML::Node kept = YAML::Load(rig.yaml);
+  EXPECT_EQ(kept["overlap"].as<std::string>(), "product");
+  EXPECT_EQ(kept["cameras"][1]["timeout"].as<double>(), 0.75);
+  const Rig again = rigFromYaml(kept, kConfigFolder, "rig.yaml");
+  EXPECT_EQ(again.overlap, rig.overlap);
+  EXPECT_EQ(again.cameras[1].timeout_s, 0.75);
+  EXPECT_EQ(again.yaml, rig.yaml);
 }
 
 TEST(OverrideTest, NamesWhatIsWrong) {

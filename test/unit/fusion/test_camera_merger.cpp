@@ -244,6 +244,12 @@ TEST(CameraMerger, RefusesVotesThatDoNotFit) {
   bad.theta.clear();
   EXPECT_THROW(mergeVotes({bad}, OverlapRule::kMean, &cloud), DataError);
   bad = good;
+  bad.time_difference_ns.pop_back();
+  EXPECT_THROW(mergeVotes({bad}, OverlapRule::kMean, &cloud), DataError);
+  bad.time_difference_ns.clear();
+  EXPECT_NO_THROW(mergeVotes({bad}, OverlapRule::kMean, &cloud));
+  EXPECT_THROW(mergeVotes({bad}, OverlapRule::kNearestInTime, &cloud), DataError);
+  bad = good;
   bad.rig_index = kMaxCameras;
   EXPECT_THROW(mergeVotes({bad}, OverlapRule::kMean, &cloud), DataError);
   EXPECT_THROW(mergeVotes(std::vector<CameraVotes>(17), OverlapRule::kMean, &cloud), DataError);

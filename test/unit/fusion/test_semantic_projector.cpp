@@ -511,6 +511,49 @@ std::vector<int> statuses(const FusionResult& result) {
   return {result.cloud.points.status.begin(), result.cloud.points.status.end()};
 }
 
+TEST(SemanticProjector, GivesTheSameBytesForEveryNumberOfThreads) {
+  for (const OcclusionMode occlusion : {OcclusionMode::kPaper, OcclusionMode::kAdaptive}) {
+    Scene scene(4);
+    scene.cloud = [] {
+      std::mt19937 random(4);
+      return randomScan(&random, 600);  // more than one thread's share of the points
+    }();
+    FusionConfig config;
+    config.class_count = Scene::kClasses;
+    config.occlusion.mode = occlusion;
+    const FusionResult first = SemanticProjector(config).fuse(scene.cloud, scene.views);
+    ASSERT_GT(first.cloud.size(), 4096u);
+    for (const int threads : {2, 5}) {
+      config.threads = threads;
+      const SemanticProjector projector(config);
+      for (int scan = 0; scan < 3; ++scan) {
+        expectSameBytes(first, projector.fuse(scene.cloud, scene.views));
+      }
+    }
+  }
+}
+
+TEST(SemanticProjector, TellsOfPixelsOnlyIfAsked) {
+  const Scene scene(6);
+  FusionConfig config;
+  config.class_count = Scene::kClasses;
+  const SemanticProjector projector(config);
+  const FusionResult with = projector.fuse(scene.cloud, scene.views);
+  const FusionResult without = projector.fuse(scene.cloud, scene.views, false);
+  ASSERT_EQ(without.cameras.size(), with.cameras.size());
+  std::size_t pixels = 0;
+  for (std::size_t k = 0; k < with.cameras.size(); ++k) {
+    EXPECT_EQ(without.cameras[k].name, with.cameras[k].name);
+    EXPECT_EQ(without.cameras[k].nonfinite, with.cameras[k].nonfinite);
+    EXPECT_TRUE(without.cameras[k].index.empty());
+    EXPECT_TRUE(without.cameras[k].label.empty());
+    pixels += with.cameras[k].label.size();
+  }
+  EXPECT_GT(pixels, 100u);
+  EXPECT_EQ(without.cloud.probabilities, with.cloud.probabilities);
+  EXPECT_EQ(without.cloud.points.status, with.cloud.points.status);
+}
+
 TEST(SemanticProjector, GivesEachStatusItsMeaning) {
   Cloud cloud = handCloud();
   addPoint(&cloud, pointAt(3, 4, 5));                                  // fused

@@ -230,6 +230,33 @@ TEST(PointCloudReader, SimulationTimeNearZeroDoesNotConfuse) {
   }
 }
 
+TEST(PointCloudReader, RelativeTimesNearZeroAreNotAbsoluteInAnotherUnit) {
+  // Stamps for which 0.1 s in the field's unit, read in a coarser one, is about the stamp.
+  for (const StampNs stamp : {80 * kNsPerSecond, 80000 * kNsPerSecond}) {
+    for (const double per_second : {1.0, 1e3, 1e6, 1e9}) {
+      for (const std::uint8_t type : {kFloat64, kUint64}) {
+        if (type == kUint64 && per_second != 1e9) continue;
+        SCOPED_TRACE(std::to_string(stamp) + " " + std::to_string(per_second));
+        Message message(3, 1, 24);
+        message.xyz().field("time", 16, type);
+        message.header.header_stamp = stamp;
+        for (std::size_t i = 0; i < 3; ++i) {
+          const double value = 0.05 * static_cast<double>(i) * per_second;
+          if (type == kUint64) {
+            message.set<std::uint64_t>(i, 16, static_cast<std::uint64_t>(value));
+          } else {
+            message.set<double>(i, 16, value);
+          }
+        }
+        const ReadCloud read = PointCloudReader({}).read(message.view());
+        EXPECT_EQ(read.time.reference, TimeReference::kStamp) << read.time.text;
+        EXPECT_EQ(read.cloud.time_ns,
+                  (std::vector<StampNs>{stamp, stamp + 50000000, stamp + 100000000}));
+      }
+    }
+  }
+}
+
 TEST(PointCloudReader, ADayFromTheStampIsNotAbsolute) {
   for (const double days : {0.9, 1.1}) {
     Message message(2, 1, 24);

@@ -371,6 +371,14 @@ TEST_F(PartlyCovered, DropTakesThemOutAndKeepsTheOrder) {
   EXPECT_EQ(result.cloud.first_point_ns, kStart) << "the key of the scan stays";
 }
 
+TEST_F(PartlyCovered, WithoutThePoseAtTheReferenceNoneIsDropped) {
+  drive.reference = last_reading + 1;
+  const CompensationResult result = run(OnMissingOdometry::kDrop);
+  EXPECT_EQ(result.counters.dropped_points, 0u);
+  EXPECT_EQ(result.cloud.x, drive.scan.x);
+  EXPECT_EQ(result.cloud.status, std::vector<std::uint8_t>(drive.scan.size(), 4));
+}
+
 TEST_F(PartlyCovered, HoldTakesTheNearestReading) {
   const CompensationResult result = run(OnMissingOdometry::kHold);
   EXPECT_EQ(result.counters.held_points, uncoveredPoints());

@@ -406,6 +406,15 @@ TEST(CompensatedCloud, RefusesHostileLayouts) {
         const float nan = std::numeric_limits<float>::quiet_NaN();
         std::memcpy(&m.data[m.point_step * 3], &nan, 4);
       },
+      [](Message& m) {  // dt beyond what a stamp can add up
+        const float year = 3e7f;
+        std::memcpy(&m.data[m.point_step * 3 + m.fields[5].offset], &year, 4);
+      },
+      [](Message& m) { m.data[m.point_step * 3 + m.fields[6].offset] = 9; },  // status
+      // As many points of no bytes as would fill any memory.
+      [](Message& m) {
+        m.width = m.height = 1u << 30, m.point_step = m.row_step = 0, m.data.clear();
+      },
   };
   for (std::size_t i = 0; i < std::size(kChanges); ++i) {
     auto message = compensatedCloudMessage(randomCloud(10));

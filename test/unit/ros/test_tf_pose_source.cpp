@@ -241,6 +241,21 @@ TEST(TfPoseSource, BoundedHistoryForgets) {
   EXPECT_EQ(source.odometry().size(), 11u);
 }
 
+TEST(TfPoseSource, GapSaysThatTheHistoryIsTooShort) {
+  TfPoseSourceConfig config;
+  config.history_ns = 10 * kNsPerSecond;
+  TfPoseSource source(config);
+  for (int i = 0; i <= 300; ++i) {
+    source.add(stamped("odom", "base_link", kStart + i * 100 * kMs, driven(0.1 * i)), false);
+  }
+  const StampNs newest = kStart + 30 * kNsPerSecond;
+  const std::string old = source.gap(newest - 20 * kNsPerSecond, newest - 19 * kNsPerSecond);
+  EXPECT_NE(old.find("older than the 10.000000000 s that are kept"), std::string::npos) << old;
+  const std::string future = source.gap(newest, newest + kNsPerSecond);
+  EXPECT_NE(future.find("is known from"), std::string::npos) << future;
+  EXPECT_EQ(future.find("older than"), std::string::npos) << future;
+}
+
 nav_msgs::Odometry odometry(const std::string& child, StampNs stamp, const Transform& T) {
   const auto as_tf = stamped("odom", child, stamp, T);
   nav_msgs::Odometry message;

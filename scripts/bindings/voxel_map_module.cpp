@@ -1,0 +1,130 @@
+// SPDX-License-Identifier: MIT
+/// The Python module semantic_lidar_fusion._voxel_map: the core's voxel map for numpy arrays, and
+/// OctoMap files where liboctomap is installed. semantic_lidar_fusion/voxel_map.py is its only user
+/// and checks shapes and types before it calls.
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include <string>
+#include <vector>
+
+#include "octomap_file.h"
+#include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/map/voxel_map.h"
+
+namespace py = pybind11;
+
+namespace semantic_lidar_fusion {
+namespace {
+
+Column column(const py::array& values) {
+  return Column{static_cast<const std::uint8_t*>(values.data()), values.strides(0)};
+}
+
+template <typename Value>
+py::array checked(const py::array& values, int dimensions, const char* name) {
+  if (!py::isinstance<py::array_t<Value>>(values) || values.ndim() != dimensions)
+    throw py::value_error(std::string(name) + ": wrong type or shape");
+  return values;
+}
+
+/// A 1-D byte array that owns `bytes`.
+py::array asArray(std::vector<std::uint8_t>&& bytes) {
+  auto* const owned = new std::vector<std::uint8_t>(std::move(bytes));
+  const py::capsule owner(owned,
+                          [](void* p) { delete static_cast<std::vector<std::uint8_t>*>(p); });
+  return py::array_t<std::uint8_t>(owned->size(), owned->data(), owner);
+}
+
+VoxelMapConfig makeConfig(double voxel_size_m, bool dirichlet, double weight, double floor,
+                          const std::vector<double>& prior, double min_range_m, double max_range_m,
+                          const std::vector<std::uint8_t>& dynamic, const std::string& points) {
+  VoxelMapConfig config;
+  config.voxel_size_m = voxel_size_m;
+  config.evidence.kind = dirichlet ? EvidenceKind::kDirichlet : EvidenceKind::kLog;
+  config.evidence.weight = weight;
+  config.evidence.floor = floor;
+  config.evidence.prior = prior;
+  config.min_range_m = min_range_m;
+  config.max_range_m = max_range_m;
+  config.dynamic = dynamic;
+  config.dynamic_points = points == "apart"     ? DynamicPoints::kApart
+                          : points == "exclude" ? DynamicPoints::kExclude
+                                                : DynamicPoints::kKeep;
+  return config;
+}
+
+std::vector<std::size_t> integrate(VoxelMap* map, const py::array& x, const py::array& y,
+                                   const py::array& z, const py::array& intensity,
+                                   const py::array& status, const py::array& label,
+                                   const py::array& probabilities, const py::array& pose,
+                                   StampNs stamp_ns) {
+  SemanticPoints points;
+  points.count = static_cast<std::size_t>(checked<float>(x, 1, "x").shape(0));
+  points.x = column(x);
+  points.y = column(checked<float>(y, 1, "y"));
+  points.z = column(checked<float>(z, 1, "z"));
+  points.intensity = column(checked<float>(intensity, 1, "intensity"));
+  points.status = column(checked<std::uint8_t>(status, 1, "status"));
+  points.label = column(checked<std::uint8_t>(label, 1, "label"));
+  points.probabilities = column(checked<float>(probabilities, 2, "probabilities"));
+  for (const py::array* values : {&y, &z, &intensity, &status, &label, &probabilities}) {
+    if (static_cast<std::size_t>(values->shape(0)) != points.count)
+      throw py::value_error("columns of different lengths");
+  }
+  if (probabilities.shape(1) != map->classCount() ||
+      (map->classCount() > 1 && probabilities.strides(1) != sizeof(float)))
+    throw py::value_error("probabilities: as many adjacent columns as the map has classes");
+  const auto matrix = checked<double>(pose, 2, "pose").cast<py::array_t<double>>();
+  if (matrix.shape(0) != 4 || matrix.shape(1) != 4) throw py::value_error("pose: must be 4 x 4");
+  Transform T_map_lidar = Transform::Identity();
+  for (int row = 0; row < 3; ++row) {
+    for (int c = 0; c < 4; ++c) T_map_lidar(row, c) = matrix.at(row, c);
+  }
+  IntegrationCounts counts;
+  {
+    const py::gil_scoped_release release;
+    counts = map->integrate(points, T_map_lidar, stamp_ns);
+  }
+  return {counts.labelled,     counts.occupied, counts.no_odometry,
+          counts.out_of_range, counts.excluded, counts.invalid};
+}
+
+void add(VoxelMap* map, const py::array_t<std::uint8_t, py::array::c_style>& records) {
+  map->add(records.data(), static_cast<std::size_t>(records.size()));
+}
+
+}  // namespace
+}  // namespace semantic_lidar_fusion
+
+PYBIND11_MODULE(_voxel_map, module) {
+  using namespace semantic_lidar_fusion;  // NOLINT: a module's body is short
+  module.doc() = "Voxel maps of class distributions; use semantic_lidar_fusion.voxel_map.";
+  py::register_exception<Error>(module, "Error");
+  py::class_<VoxelMap>(module, "VoxelMap")
+      .def(py::init([](double voxel_size_m, bool dirichlet, double weight, double floor,
+                       const std::vector<double>& prior, double min_range_m, double max_range_m,
+                       const std::vector<std::uint8_t>& dynamic, const std::string& points) {
+        return new VoxelMap(makeConfig(voxel_size_m, dirichlet, weight, floor, prior, min_range_m,
+                                       max_range_m, dynamic, points));
+      }))
+      .def("__len__", &VoxelMap::size)
+      .def_property_readonly("memory_bytes", &VoxelMap::memoryBytes)
+      .def("integrate", &integrate)
+      .def("add", &add)
+      .def("records", [](const VoxelMap& map, bool sorted) { return asArray(map.records(sorted)); })
+      .def("keep_inside", &VoxelMap::keepInside)
+      .def("clear", &VoxelMap::clear);
+  module.attr("has_octomap") = hasOctomap();
+  module.def("write_octomap",
+             [](const py::array_t<double, py::array::c_style>& xyz,
+                const py::array_t<std::uint8_t, py::array::c_style>& rgb, double size,
+                const std::string& color_path, const std::string& binary_path) {
+               if (xyz.ndim() != 2 || rgb.ndim() != 2 || xyz.shape(1) != 3 || rgb.shape(1) != 3 ||
+                   xyz.shape(0) != rgb.shape(0))
+                 throw py::value_error("xyz and rgb: must be (N, 3) of the same N");
+               writeOctomap(xyz.data(), rgb.data(), static_cast<std::size_t>(xyz.shape(0)), size,
+                            color_path, binary_path);
+             });
+}

@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: MIT
+// Compiled with AVX2 enabled: includes and uses nothing that could be emitted as a shared inline
+// function (see slic_kernels.h).
+#include <immintrin.h>
+
+#include "map_kernels.h"
+#include "map_kernels_local.h"
+
+namespace semantic_lidar_fusion {
+
+void logEvidenceAvx2(const float* probabilities, std::size_t count,
+                     const EvidenceConstants& constants, const std::int32_t* prior,
+                     std::int32_t* evidence) {
+  const __m256 floor = _mm256_set1_ps(constants.floor), one = _mm256_set1_ps(1.0f);
+  const __m256 scale = _mm256_set1_ps(constants.scale), half = _mm256_set1_ps(0.5f);
+  const __m256i octave = _mm256_set1_epi32(constants.octave);
+  const __m256i root_half = _mm256_set1_epi32(kRootHalfBits);
+  const __m256i significand = _mm256_set1_epi32(kSignificand);
+  const __m256i rounding = _mm256_set1_epi32(1 << (kGuardBits - 1));
+  std::size_t i = 0;
+  for (; i + 8 <= count; i += 8) {
+    // max and min return their second operand if one is NaN.
+    const __m256 p = _mm256_min_ps(_mm256_max_ps(_mm256_loadu_ps(probabilities + i), floor), one);
+    const __m256i above = _mm256_sub_epi32(_mm256_castps_si256(p), root_half);
+    const __m256i exponent = _mm256_srai_epi32(above, 23);
+    const __m256 f = _mm256_sub_ps(
+        _mm256_castsi256_ps(_mm256_add_epi32(_mm256_and_si256(above, significand), root_half)),
+        one);
+    __m256 y = _mm256_set1_ps(kLog[8]);
+    for (int k = 7; k >= 0; --k) y = _mm256_add_ps(_mm256_mul_ps(y, f), _mm256_set1_ps(kLog[k]));
+    const __m256 square = _mm256_mul_ps(f, f);
+    y = _mm256_mul_ps(_mm256_mul_ps(f, square), y);
+    y = _mm256_sub_ps(y, _mm256_mul_ps(half, square));
+    const __m256i fine = _mm256_cvttps_epi32(_mm256_mul_ps(_mm256_add_ps(f, y), scale));
+    __m256i sum = _mm256_add_epi32(_mm256_mullo_epi32(exponent, octave), fine);
+    sum = _mm256_sub_epi32(sum, _mm256_loadu_si256(reinterpret_cast<const __m256i*>(prior + i)));
+    sum = _mm256_srai_epi32(_mm256_add_epi32(sum, rounding), kGuardBits);
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(evidence + i), sum);
+  }
+  logEvidencePlain(probabilities + i, count - i, constants, prior + i, evidence + i);
+}
+
+void addEvidenceAvx2(const std::int32_t* evidence, int class_count, std::int64_t* sums) {
+  int c = 0;
+  for (; c + 4 <= class_count; c += 4) {
+    __m256i* const at = reinterpret_cast<__m256i*>(sums + c);
+    const __m256i added =
+        _mm256_cvtepi32_epi64(_mm_loadu_si128(reinterpret_cast<const __m128i*>(evidence + c)));
+    _mm256_storeu_si256(at, _mm256_add_epi64(_mm256_loadu_si256(at), added));
+  }
+  for (; c < class_count; ++c) sums[c] += evidence[c];
+}
+
+void placePointsAvx2(const PlacementConstants& constants, PlacedPoints* points) {
+  placeAll(constants, points);
+}
+
+}  // namespace semantic_lidar_fusion

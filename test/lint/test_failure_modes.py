@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: MIT
+"""test/README.md: every failure mode has its tests and each of them exists; and what source text
+alone can show of them."""
+
+import glob
+import os
+import re
+
+SOURCE_DIR = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+FAILURE_MODES = 29
+
+
+def read(path):
+    with open(path, encoding="utf-8") as file:
+        return file.read()
+
+
+def rows(text):
+    """Number of a failure mode -> its row."""
+    return {int(m.group(1)): m.group(0) for m in re.finditer(r"^\| (\d+) \|.*$", text, re.M)}
+
+
+def test_names(text):
+    """Names in backquotes that look like tests."""
+    pattern = r"`((?:\w+\.py::\w+)|(?:\w+\.sh)|(?:[A-Z]\w*\.[A-Z]\w*))`"
+    return set(re.findall(pattern, text))
+
+
+test_names.__test__ = False
+
+
+def existing_tests():
+    """Names of all tests, in the form of the table."""
+    found = set()
+    for path in glob.glob(os.path.join(SOURCE_DIR, "test", "**", "*.cpp"), recursive=True):
+        for suite, name in re.findall(r"^TEST(?:_[FP])?\((\w+),\s*(\w+)\)", read(path), re.M):
+            found.add("%s.%s" % (suite, name))
+    for folder in ("python", "lint", "gate", "ros"):
+        for path in glob.glob(os.path.join(SOURCE_DIR, "test", folder, "*.py")):
+            for name in re.findall(r"^\s*def (test_\w+)\(", read(path), re.M):
+                found.add("%s::%s" % (os.path.basename(path), name))
+    for path in glob.glob(os.path.join(SOURCE_DIR, "test", "shell", "*.sh")):
+        found.add(os.path.basename(path))
+    return found
+
+
+def table():
+    return read(os.path.join(SOURCE_DIR, "test", "README.md"))
+
+
+def test_every_failure_mode_has_a_row_with_tests():
+    found = rows(table())
+    assert sorted(found) == list(range(1, FAILURE_MODES + 1))
+    without = [number for number, row in found.items() if not test_names(row)]
+    assert without == []
+
+
+def test_every_test_of_the_table_exists():
+    assert sorted(test_names(table()) - existing_tests()) == []
+
+
+def test_rostests_of_the_table_are_started():
+    """A Python file below test/ros runs only if a .test file names it."""
+    started = "".join(
+        read(path) for path in glob.glob(os.path.join(SOURCE_DIR, "test", "ros", "*.test"))
+    )
+    for name in test_names(table()):
+        file = name.split("::")[0]
+        if os.path.isfile(os.path.join(SOURCE_DIR, "test", "ros", file)):
+            assert 'type="%s"' % file in started, file
+
+
+def sources(*folders):
+    for folder in folders:
+        for path in glob.glob(os.path.join(SOURCE_DIR, folder, "**", "*"), recursive=True):
+            if path.endswith((".h", ".cpp", ".py")):
+                yield path, read(path)
+
+
+def test_nothing_publishes_tf():
+    for path, text in sources("nodelets", "src", "include", "scripts"):
+        assert "TransformBroadcaster" not in text, path
+        assert not re.search(r"advertise<tf2?_msgs", text), path
+
+
+def test_every_subscription_is_without_delay():
+    """Nodelets subscribe through FusionNodelet::subscribe; the few others give their own hints."""
+    calls = 0
+    for path, text in sources("nodelets"):
+        for call in re.finditer(r"(?:handle|NodeHandle\(\))\.subscribe<", text):
+            calls += 1
+            statement = text[call.start() : text.index(";", text.index("VoidConstPtr", call.end()))]
+            assert re.search(r"tcpNoDelay\(\)|hints\)$", statement), (path, statement)
+        if "hints)" in text:
+            assert "TransportHints().tcpNoDelay()" in text, path
+    assert calls >= 4
+
+
+def test_nothing_waits_inside_tf():
+    for path, text in sources("nodelets", "src", "include"):
+        for word in ("MessageFilter", "message_filters/", "waitForTransform", "tf2_ros/buffer"):
+            assert word not in text, (path, word)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""The whole chain on the simulated street: exact where it can be, better step by step elsewhere."""
+
+import os
+import subprocess
+
+import numpy as np
+import pytest
+
+rosbag = pytest.importorskip("rosbag")
+
+from conftest import SOURCE_DIR  # noqa: E402
+from semantic_lidar_fusion import evaluation  # noqa: E402
+
+BIN_DIR = os.environ.get("SLF_BIN_DIR", "")
+PROGRAMS = [os.path.join(BIN_DIR, name) for name in ("simulate_drive", "fuse_bag")]
+pytestmark = pytest.mark.skipif(
+    not all(os.access(program, os.X_OK) for program in PROGRAMS),
+    reason="simulate_drive or fuse_bag is not built (Embree 3 is absent)",
+)
+RIG = os.path.join(SOURCE_DIR, "config", "demo.yaml")
+
+
+def run(*command):
+    done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_nothing_is_wrong_where_nothing_is_uncertain(tmp_path):
+    """Exact odometry, a perfect network, no range noise, a standing street: every point that its
+    cameras really see, further than 1.5 px from a class edge, gets its own class."""
+    bag, fused = tmp_path / "exact.bag", tmp_path / "fused.bag"
+    simulate = [PROGRAMS[0], "--out", bag, "--duration", "0.3", "--scale", "0.3", "--quiet"]
+    run(*(simulate + ["--exact", "--static", "--speed", "15"]))
+    run(PROGRAMS[1], bag, fused, "--rig", RIG, "--quiet")
+    rig = evaluation.Rig(RIG)
+    truth = evaluation.Truth(str(bag), len(rig.labels))
+    clouds = evaluation.FusedBag(str(fused), rig.labels.names)
+    score = evaluation.Score("exact", rig.labels, 1.5)
+    names = [camera["name"] for camera in rig.cameras]
+    checked, wrong = np.zeros(len(names), int), np.zeros(len(names), int)
+    for _, cloud, scan in evaluation.paired(truth, clouds):
+        chosen = score.select(cloud, scan)
+        bits = cloud.optional("cameras")
+        bad = cloud.label != scan.label
+        for index, name in enumerate(names):
+            # By its own image: edges in others are of no concern to it.
+            here = chosen & (bits >> index & 1).astype(bool)
+            assert (scan.points["edge_px_" + name][here] > 1.5).all()
+            checked[index] += here.sum()
+            wrong[index] += (here & bad).sum()
+    assert wrong.tolist() == [0] * len(names)
+    # Each of the five cameras has seen its part of three scans.
+    assert (checked > 3000).all(), checked
+
+
+def test_each_step_helps_on_a_fast_drive(tmp_path):
+    """With the perfect network, what is left to err is geometry: motion correction and mask must
+    both make it less, and F1 of every class must rise from the first to the last."""
+    bag = tmp_path / "drive.bag"
+    simulate = [PROGRAMS[0], "--out", bag, "--duration", "0.3", "--scale", "0.3", "--quiet"]
+    run(*(simulate + ["--perfect-network", "--static", "--speed", "15"]))
+    rig = evaluation.Rig(RIG)
+    truth = evaluation.Truth(str(bag), len(rig.labels))
+    scores = []
+    for configuration in rig.configurations():
+        fused = str(tmp_path / (configuration.name + ".bag"))
+        evaluation.run_fuse_bag(PROGRAMS[1], str(bag), fused, RIG, configuration.settings)
+        clouds = evaluation.FusedBag(fused, rig.labels.names)
+        scores.append(evaluation.score_bag(configuration.name, clouds, truth, rig.labels))
+    accuracy = [score.confusion.accuracy for score in scores]
+    assert accuracy[0] < accuracy[1] < accuracy[2]
+    first, last = scores[0].confusion, scores[2].confusion
+    present = last.support > 100
+    assert present.sum() >= 6
+    assert (last.f1[present] > first.f1[present]).all()

@@ -1,0 +1,153 @@
+// SPDX-License-Identifier: MIT
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <cstring>
+#include <map>
+#include <random>
+#include <tuple>
+#include <vector>
+
+#include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/map/voxel_map.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+constexpr int kClasses = 3;
+
+struct Point {
+  float x = 0, y = 0, z = 0, intensity = 0;
+  std::uint8_t status = 0, label = 0;
+  float p[kClasses] = {};
+};
+
+SemanticPoints view(const std::vector<Point>& points) {
+  SemanticPoints result;
+  result.count = points.size();
+  if (points.empty()) return result;
+  const auto column = [](const void* first) {
+    return Column{static_cast<const std::uint8_t*>(first), sizeof(Point)};
+  };
+  const Point& first = points.front();
+  result.x = column(&first.x);
+  result.y = column(&first.y);
+  result.z = column(&first.z);
+  result.intensity = column(&first.intensity);
+  result.status = column(&first.status);
+  result.label = column(&first.label);
+  result.probabilities = column(first.p);
+  return result;
+}
+
+VoxelMapConfig config() {
+  VoxelMapConfig result;
+  result.voxel_size_m = 0.25;
+  result.evidence.prior = {0.5, 0.25, 0.25};
+  result.dynamic = {0, 0, 1};
+  return result;
+}
+
+std::vector<Point> cloud(int seed, int count) {
+  std::mt19937 random(static_cast<unsigned>(seed));
+  std::normal_distribution<float> coordinate(0.0f, 10.0f);
+  std::uniform_real_distribution<float> share(0.0f, 1.0f);
+  std::vector<Point> points(static_cast<std::size_t>(count));
+  for (Point& point : points) {
+    point.x = coordinate(random);
+    point.y = coordinate(random);
+    point.z = coordinate(random);
+    point.intensity = 100.0f * share(random);
+    point.status = static_cast<std::uint8_t>(random() % 5);
+    float sum = 0.0f;
+    for (float& p : point.p) sum += p = share(random);
+    for (float& p : point.p) p /= sum;
+    for (int c = 1; c < kClasses; ++c) {
+      if (point.p[c] > point.p[point.label]) point.label = static_cast<std::uint8_t>(c);
+    }
+  }
+  return points;
+}
+
+Transform pose(double x) {
+  Transform result = Transform::Identity();
+  result.linear() = Eigen::AngleAxisd(0.3 * x, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  result.translation() = Eigen::Vector3d(331000.0 + x, 6250000.0, 30.0);
+  return result;
+}
+
+TEST(VoxelMap, HoldsEveryPointWhereItIs) {
+  VoxelMap map(config());
+  const std::vector<Point> points = cloud(1, 20000);
+  const IntegrationCounts counts = map.integrate(view(points), pose(2.0), 77);
+  std::map<std::tuple<int, int, int, int>, std::pair<int, int>> expected;
+  for (const Point& point : points) {
+    if (point.status > 3) continue;
+    const Eigen::Vector3d at = pose(2.0) * Eigen::Vector3d(point.x, point.y, point.z);
+    const int layer = point.status == 0 && point.label == 2 ? 1 : 0;
+    auto& entry = expected[{static_cast<int>(std::floor(at.x() / 0.25)),
+                            static_cast<int>(std::floor(at.y() / 0.25)),
+                            static_cast<int>(std::floor(at.z() / 0.25)), layer}];
+    ++entry.first;
+    entry.second += point.status == 0 ? 1 : 0;
+  }
+  ASSERT_EQ(map.size(), expected.size());
+  EXPECT_EQ(counts.labelled + counts.occupied + counts.no_odometry, points.size());
+  const std::vector<std::uint8_t> records = map.records();
+  for (std::size_t i = 0; i < map.size(); ++i) {
+    VoxelHeader voxel;
+    std::memcpy(&voxel, records.data() + i * map.recordSize(), sizeof voxel);
+    const auto found = expected.find({voxel.x, voxel.y, voxel.z, static_cast<int>(voxel.layer)});
+    ASSERT_NE(found, expected.end());
+    EXPECT_EQ(voxel.observations, static_cast<unsigned>(found->second.first));
+    EXPECT_EQ(voxel.labelled, static_cast<unsigned>(found->second.second));
+    EXPECT_EQ(voxel.first_ns, 77);
+  }
+}
+
+TEST(VoxelMap, OrderAndMergingChangeNoBit) {
+  VoxelMap whole(config()), backwards(config()), sum(config());
+  for (int i = 0; i < 8; ++i) {
+    whole.integrate(view(cloud(i, 5000)), pose(i), i);
+    backwards.integrate(view(cloud(7 - i, 5000)), pose(7 - i), 7 - i);
+    VoxelMap part(config());
+    part.integrate(view(cloud(i, 5000)), pose(i), i);
+    const std::vector<std::uint8_t> records = part.records(i % 2 == 0);
+    sum.add(records.data(), records.size());
+  }
+  EXPECT_EQ(whole.records(), backwards.records());
+  EXPECT_EQ(whole.records(), sum.records());
+}
+
+TEST(VoxelMap, ForgetsWhatIsOutside) {
+  VoxelMap map(config());
+  map.integrate(view(cloud(3, 20000)), pose(0.0), 0);
+  const std::size_t before = map.size(), bytes = map.memoryBytes();
+  const int x = static_cast<int>(331000 / 0.25);
+  map.keepInside({x - 8, -(1 << 30), -(1 << 30)}, {x + 8, 1 << 30, 1 << 30});
+  EXPECT_LT(map.size(), before / 2);
+  EXPECT_LT(map.memoryBytes(), bytes);
+  // It is still one map: the same points again make no voxel twice.
+  map.integrate(view(cloud(3, 20000)), pose(0.0), 0);
+  EXPECT_EQ(map.size(), before);
+}
+
+TEST(VoxelMap, RefusesBrokenRecordsAndConfigurations) {
+  VoxelMap map(config());
+  const std::vector<std::uint8_t> bytes(map.recordSize() + 1);
+  EXPECT_THROW(map.add(bytes.data(), bytes.size()), DataError);
+  VoxelMapConfig wrong = config();
+  wrong.voxel_size_m = 0.0;
+  wrong.max_range_m = -1.0;
+  EXPECT_THROW(VoxelMap{wrong}, ConfigError);
+}
+
+TEST(VoxelMap, AnEmptyCloudChangesNothing) {
+  VoxelMap map(config());
+  map.integrate(view({}), pose(0.0), 0);
+  EXPECT_EQ(map.size(), 0u);
+  EXPECT_TRUE(map.records().empty());
+}
+
+}  // namespace
+}  // namespace semantic_lidar_fusion
