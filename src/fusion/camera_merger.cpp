@@ -7,8 +7,8 @@
 #include <limits>
 #include <string>
 
-#include "../superpixel/softmax_kernels.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/softmax_kernels.h"
 #include "semantic_lidar_fusion/common/thread_pool.h"
 
 namespace semantic_lidar_fusion {

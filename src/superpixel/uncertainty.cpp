@@ -8,7 +8,7 @@
 #include "score_kernels.h"
 #include "semantic_lidar_fusion/common/cell_grid.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "softmax_kernels.h"
+#include "semantic_lidar_fusion/common/softmax_kernels.h"
 
 namespace semantic_lidar_fusion {
 namespace {

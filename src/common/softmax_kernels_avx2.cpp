@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: MIT
 // Compiled with AVX2 enabled: includes and uses nothing that could be emitted as a shared inline
-// function (see slic_kernels.h).
+// function (see superpixel/slic_kernels.h).
 #include <immintrin.h>
 
-#include "softmax_kernels.h"
+#include "semantic_lidar_fusion/common/softmax_kernels.h"
 
 namespace semantic_lidar_fusion {
 namespace {

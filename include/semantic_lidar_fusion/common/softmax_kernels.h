@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 /// Exponentials and logarithms of class distributions in double precision: plain C++ and a version
-/// for wider registers that gives the same bytes (see slic_kernels.h for why it has a file of its
-/// own). Both are polynomials, so that results do not depend on the machine's mathematics library.
+/// for wider registers that gives the same bytes, in a file of its own. Both are polynomials, so
+/// that results do not depend on the machine's mathematics library.
 #pragma once
 
 namespace semantic_lidar_fusion {

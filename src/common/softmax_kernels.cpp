@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-#include "softmax_kernels.h"
+#include "semantic_lidar_fusion/common/softmax_kernels.h"
 
 #include <cmath>
 #include <cstdint>

@@ -9,7 +9,7 @@
 #include <string>
 #include <vector>
 
-#include "superpixel/softmax_kernels.h"
+#include "semantic_lidar_fusion/common/softmax_kernels.h"
 
 namespace semantic_lidar_fusion {
 namespace {
