@@ -3,6 +3,7 @@
 
 #include <nodelet/detail/callback_queue.h>
 #include <ros/master.h>
+#include <std_msgs/String.h>
 
 #include <algorithm>
 #include <string>
@@ -91,6 +92,7 @@ void FusionNodelet::onInit() {
       NODELET_WARN_STREAM(problem);
     }
     rig_ = loadRigFromParameters(getPrivateNodeHandle());
+    publishConfiguration();
     diagnostics_ = std::make_unique<diagnostic_updater::Updater>(getNodeHandle(),
                                                                  getPrivateNodeHandle(), getName());
     diagnostics_->setHardwareID(rig_.name.empty() ? "none" : rig_.name);
@@ -117,6 +119,14 @@ void FusionNodelet::onInit() {
   } catch (const std::exception& problem) {
     NODELET_FATAL_STREAM("cannot start: " << problem.what());
   }
+}
+
+void FusionNodelet::publishConfiguration() {
+  const auto message = boost::make_shared<std_msgs::String>();
+  message->data = "version: " SLF_VERSION "\n" + rig_.yaml + "\n";
+  configuration_ = getPrivateNodeHandle().advertise<std_msgs::String>("configuration", 1, true);
+  configuration_.publish(message);
+  health_.set("version", SLF_VERSION);
 }
 
 void FusionNodelet::startTicking() {

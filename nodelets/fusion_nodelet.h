@@ -167,6 +167,8 @@ class FusionNodelet : public nodelet::Nodelet {
   std::pair<StampNs, StampNs> simulatedClock() const;
   void reportOverflow(const std::string& topic);
   void keepQueues();
+  /// Tells, latched, which version runs with which rig.
+  void publishConfiguration();
 
   /// Messages between roscpp and an Inbox, which takes them at once: never reached unless all
   /// threads of the manager are busy for long.
@@ -188,6 +190,7 @@ class FusionNodelet : public nodelet::Nodelet {
   Health::Clock::time_point started_ = Health::Clock::now();
   Health::Clock::time_point watched_ = started_;
   std::unique_ptr<diagnostic_updater::Updater> diagnostics_;
+  ros::Publisher configuration_;
   ros::WallTimer diagnostics_timer_, tick_timer_;
 };
 

@@ -51,9 +51,11 @@ PointCloudBytes cloudBytes(const sensor_msgs::PointCloud2& message, const std::s
 
 }  // namespace
 
-LidarDecoder::LidarDecoder(const LidarConfig& config, CountDrops count_drops)
+LidarDecoder::LidarDecoder(const LidarConfig& config, CountDrops count_drops,
+                           CountDrops count_left_out)
     : config_(config),
       count_drops_(std::move(count_drops)),
+      count_left_out_(count_left_out ? std::move(count_left_out) : count_drops_),
       packets_(packetConfig(config)),
       clouds_(cloudConfig(config)) {}
 
@@ -74,8 +76,8 @@ TimedCloud LidarDecoder::decode(const VelodyneScan& message) {
   count_drops_("duplicate packets", counters.duplicate_packets);
   count_drops_("packets of zeros", counters.zero_packets);
   count_drops_("bad packet blocks", counters.bad_blocks);
-  count_drops_("points out of range", counters.out_of_range_points);
-  count_drops_("second returns equal to the first", counters.equal_returns);
+  count_left_out_("points out of range", counters.out_of_range_points);
+  count_left_out_("second returns equal to the first", counters.equal_returns);
   for (const auto& [reason, count] : counters.unknown_packets) {
     count_drops_("packets with " + reason, count);
   }
@@ -84,8 +86,8 @@ TimedCloud LidarDecoder::decode(const VelodyneScan& message) {
 
 TimedCloud LidarDecoder::decode(const sensor_msgs::PointCloud2& message) {
   ReadCloud read = clouds_.read(cloudBytes(message, frame(message.header.frame_id)));
-  count_drops_("points that are not finite", read.counters.non_finite_points);
-  count_drops_("points out of range", read.counters.out_of_range_points);
+  count_left_out_("points that are not finite", read.counters.non_finite_points);
+  count_left_out_("points out of range", read.counters.out_of_range_points);
   if (!read.cloud.empty()) {
     time_decision_ = read.time.text;
     time_decision_is_doubtful_ = read.time.warning;

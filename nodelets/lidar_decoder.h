@@ -17,11 +17,12 @@ namespace semantic_lidar_fusion {
 
 class LidarDecoder {
  public:
-  /// Told of what was discarded: reason and number.
+  /// Told of what was discarded: reason and number (0 too).
   using CountDrops = std::function<void(const std::string& reason, std::uint64_t count)>;
 
-  /// Throws ConfigError.
-  LidarDecoder(const LidarConfig& config, CountDrops count_drops);
+  /// `count_left_out` is told of what is discarded as intended (range limits, points without a
+  /// value, second returns equal to the first); without it `count_drops` is. Throws ConfigError.
+  LidarDecoder(const LidarConfig& config, CountDrops count_drops, CountDrops count_left_out = {});
 
   /// Finite points within the range limits; the frame is `lidar.frame` or the message's. Throws
   /// DataError (no frame, malformed layout).
@@ -37,7 +38,7 @@ class LidarDecoder {
   std::string frame(const std::string& message_frame) const;
 
   LidarConfig config_;
-  CountDrops count_drops_;
+  CountDrops count_drops_, count_left_out_;
   PacketDecoder packets_;
   PointCloudReader clouds_;
   std::string time_decision_;

@@ -46,10 +46,12 @@ class MotionCompensationNodelet : public FusionNodelet {
   };
 
   void initialize() override {
-    lidar_ = std::make_unique<LidarDecoder>(rig().lidar,
-                                            [this](const std::string& reason, std::uint64_t count) {
-                                              health().count("dropped: " + reason, count);
-                                            });
+    lidar_ = std::make_unique<LidarDecoder>(
+        rig().lidar,
+        [this](const std::string& reason, std::uint64_t count) { onDropped(reason, count); },
+        [this](const std::string& reason, std::uint64_t count) {
+          health().count("left out: " + reason, count);
+        });
     // The selection nodelet settles t_ref within its own timeout; the rest is grace for its thread.
     longest_reference_wait_ns_ = toNs(rig().reference.timeout_s) + kReferenceGraceNs;
     tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
@@ -98,6 +100,14 @@ class MotionCompensationNodelet : public FusionNodelet {
                           " others wait for odometry or scan_reference");
     }
     release();
+  }
+
+  void onDropped(const std::string& reason, std::uint64_t count) {
+    if (count == 0) return;
+    health().count("dropped: " + reason, count);
+    const std::string topic = getNodeHandle().resolveName(rig().lidar.topic);
+    warn("lidar " + reason, topic + ": " + std::to_string(count) + " " + reason +
+                                " in a scan; the rest of the scan is used");
   }
 
   /// Tells once how the times of the points are understood.

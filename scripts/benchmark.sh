@@ -144,7 +144,7 @@ if wanted superpixels; then
   else
     step "no photographs at $photographs"
   fi
-  if simulated street.bag --images all --width 960 --duration 1; then
+  if simulated street.bag --images all --width 960 --duration 1 --seed 7; then
     sets+=(--street "$out/street.bag")
   else
     step "no street: simulate_drive is not built"
@@ -160,7 +160,7 @@ fi
 
 if wanted rig; then
   rm -f "$out/rig.json"
-  if simulated rig.bag --scale 1 --duration 2; then
+  if simulated rig.bag --scale 1 --duration 3; then
     step "the whole rig, three times $seconds s"
     /usr/bin/python3 "$source_dir/test/benchmark/benchmark_rig.py" --bin-dir "$bin" \
       --bag "$out/rig.bag" --rig "$source_dir/config/demo.yaml" --seconds "$seconds" \

@@ -81,6 +81,7 @@ case $sanitize in
     ;;
   thread)
     export TSAN_OPTIONS=ignore_noninstrumented_modules=1:exitcode=66
+    TSAN_OPTIONS+=:suppressions=$source_dir/test/gate/tsan.supp
     export SLF_LAUNCH_PREFIX="env LD_PRELOAD=$(g++ -print-file-name=libtsan.so)"
     ;;
   undefined)

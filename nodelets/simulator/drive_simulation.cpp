@@ -65,8 +65,8 @@ class Bag {
       if (!force) throw Error(path + ": exists; give --force to replace it");
     }
     try {
-      bag_.open(temporary_, rosbag::bagmode::Write);
-      bag_.setCompression(rosbag::compression::LZ4);
+      bag_->open(temporary_, rosbag::bagmode::Write);
+      bag_->setCompression(rosbag::compression::LZ4);
     } catch (const rosbag::BagException& e) {
       throw Error(path + ": cannot be written: " + e.what());
     }
@@ -74,8 +74,8 @@ class Bag {
   ~Bag() {
     if (committed_) return;
     try {
-      bag_.close();
-    } catch (const std::exception&) {
+      close();
+    } catch (const Error&) {
       // Of no interest: the file goes.
     }
     ::unlink(temporary_.c_str());
@@ -94,18 +94,14 @@ class Bag {
     (*header)["callerid"] = "/simulate_drive";
     (*header)["latching"] = latched ? "1" : "0";
     try {
-      bag_.write(topic, rosTime(record_ns), message, header);
+      bag_->write(topic, rosTime(record_ns), message, header);
     } catch (const rosbag::BagException& e) {
       throw Error(path_ + ": cannot be written: " + e.what());
     }
   }
 
   void commit() {
-    try {
-      bag_.close();
-    } catch (const rosbag::BagException& e) {
-      throw Error(path_ + ": cannot be written: " + e.what());
-    }
+    close();
     if (std::rename(temporary_.c_str(), path_.c_str()) != 0) {
       throw Error(path_ + ": cannot be written: " + std::strerror(errno));
     }
@@ -113,8 +109,21 @@ class Bag {
   }
 
  private:
+  /// Closes the bag once. One that cannot be closed is left alone: its destructor would write to it
+  /// again, and an exception there ends the program.
+  void close() {
+    if (!bag_) return;
+    try {
+      bag_->close();
+      bag_.reset();
+    } catch (const rosbag::BagException& e) {
+      bag_.release();
+      throw Error(path_ + ": cannot be written: " + e.what());
+    }
+  }
+
   std::string path_, temporary_;
-  rosbag::Bag bag_;
+  std::unique_ptr<rosbag::Bag> bag_ = std::make_unique<rosbag::Bag>();
   bool committed_ = false;
 };
 

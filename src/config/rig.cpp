@@ -547,6 +547,7 @@ Rig rigFromYaml(const YAML::Node& root, const std::string& base_directory,
   }
   Rig rig = readRig(tree, base_directory, source_name, &problems);
   if (!problems.empty()) throw ConfigError(std::move(problems));
+  rig.yaml = YAML::Dump(tree);
   return rig;
 }
 

@@ -3,7 +3,8 @@
 
 #include <algorithm>
 #include <cmath>
-#include <optional>
+#include <limits>
+#include <numeric>
 
 namespace semantic_lidar_fusion {
 
@@ -12,13 +13,75 @@ namespace {
 /// How far a mask reaches where its surface ends, as a part of the way to the next beam. The end is
 /// somewhere in between: with r, (1 - r)^2 / 2 of a beam's hidden points slip through and r^2 / 2
 /// of its visible ones are lost, and a wrong label is worse than none.
-constexpr double kEdgeReach = 0.75;
+constexpr float kEdgeReach = 0.75f;
 /// The same, up and down, for a return that continues on neither side: often a level surface seen
-/// edge-on (a roof), of which a tall mask would be wrong.
-constexpr double kLoneReach = 0.5;
+/// edge-on (a roof), of which a tall mask would be wrong; and to all sides for one on no surface.
+constexpr float kLoneReach = 0.5f;
+/// px around each mask, so that twisted neighbours leave no cracks.
+constexpr float kSlack_px = 0.5f;
 
-/// Masks of mode `adaptive`: a buffer of the nearest mask on each pixel. Where the masks are tall
-/// the buffer holds one cell for several pixels along them.
+/// The points in the image, tile by tile, with the farthest of each tile: most surfaces have
+/// nothing behind them.
+class Tiles {
+ public:
+  Tiles(const ProjectedPoints& points, const ImageSize& size, float tile_px)
+      : per_px_(1.0f / tile_px),
+        columns_(1 + static_cast<int>(static_cast<float>(size.width) * per_px_)),
+        rows_(1 + static_cast<int>(static_cast<float>(size.height) * per_px_)),
+        begin_(static_cast<std::size_t>(columns_) * static_cast<std::size_t>(rows_) + 1, 0),
+        far_(begin_.size(), 0.0f) {
+    constexpr std::uint32_t kOutside = 0xFFFFFFFFu;
+    std::vector<std::uint32_t> tile(points.size(), kOutside);
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      if (!inImage(points.u[i], points.v[i], size)) continue;
+      tile[i] = static_cast<std::uint32_t>(row(points.v[i]) * columns_ + column(points.u[i]));
+      ++begin_[tile[i] + 1];
+      far_[tile[i]] = std::max(far_[tile[i]], points.distance[i]);
+    }
+    std::partial_sum(begin_.begin(), begin_.end(), begin_.begin());
+    std::vector<std::uint32_t> next(begin_.begin(), begin_.end() - 1);
+    points_.resize(begin_.back());
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      if (tile[i] == kOutside) continue;
+      points_[next[tile[i]]++] = {points.u[i], points.v[i], points.distance[i],
+                                  static_cast<std::uint32_t>(i)};
+    }
+  }
+
+  struct Point {
+    float u, v, distance;
+    std::uint32_t place;  ///< in the projected points
+  };
+
+  /// Calls visit(Point) for the points of all tiles that a box touches and in which something is
+  /// farther than `nearest`.
+  template <typename Visit>
+  void visit(float u_low, float u_high, float v_low, float v_high, float nearest,
+             const Visit& visit) const {
+    const int x_begin = column(u_low), x_end = column(u_high);
+    for (int y = row(v_low), y_end = row(v_high); y <= y_end; ++y) {
+      for (int x = x_begin; x <= x_end; ++x) {
+        const auto tile = static_cast<std::size_t>(y * columns_ + x);
+        if (!(far_[tile] > nearest)) continue;
+        for (std::uint32_t k = begin_[tile]; k < begin_[tile + 1]; ++k) visit(points_[k]);
+      }
+    }
+  }
+
+ private:
+  int column(float u) const { return clamped((u + 0.5f) * per_px_, columns_); }
+  int row(float v) const { return clamped((v + 0.5f) * per_px_, rows_); }
+  static int clamped(float at, int count) {
+    return static_cast<int>(std::max(0.0f, std::min(at, static_cast<float>(count - 1))));
+  }
+
+  float per_px_;
+  int columns_, rows_;
+  std::vector<std::uint32_t> begin_;  ///< into points_, one more than tiles
+  std::vector<float> far_;            ///< m
+  std::vector<Point> points_;
+};
+
 class SurfaceMasks {
  public:
   SurfaceMasks(const Cloud& cloud, const ProjectedPoints& points, const Transform& T_camera_lidar,
@@ -28,38 +91,23 @@ class SurfaceMasks {
         T_camera_lidar_(T_camera_lidar),
         camera_(camera),
         grid_(grid),
-        config_(config),
+        margin_m_(static_cast<float>(config.depth_margin_m)),
+        margin_ratio_(static_cast<float>(config.depth_margin_ratio)),
+        tiles_(points, camera.imageSize(),
+               std::max(4.0f, static_cast<float>(0.5 * camera.fy() * grid.vertical_step_rad))),
         slot_(cloud.size(), -1) {
-    constexpr double kCellsPerStep = 10.0;
-    constexpr int kLargestCell_px = 8;
-    const Eigen::Vector3d up = T_camera_lidar.linear().col(2);
-    const auto cell = [&](double upright, double focal_px) {
-      const double px = focal_px * grid.vertical_step_rad / kCellsPerStep;
-      return upright < 0.8 ? 1
-                           : std::max(1, static_cast<int>(std::min<double>(px, kLargestCell_px)));
-    };
-    cell_x_ = cell(std::abs(up.x()), camera.fx());
-    cell_y_ = cell(std::abs(up.y()), camera.fy());
-    columns_ = (camera.imageSize().width + cell_x_ - 1) / cell_x_;
-    rows_ = (camera.imageSize().height + cell_y_ - 1) / cell_y_;
-    nearness_.assign(static_cast<std::size_t>(columns_) * static_cast<std::size_t>(rows_), 0.0f);
     for (std::size_t i = 0; i < points.size(); ++i) {
       slot_[points.index[i]] = static_cast<std::int32_t>(i);
     }
   }
 
   std::vector<std::uint8_t> visible() {
+    visible_.assign(points_.size(), 1);
     for (std::size_t i = 0; i < points_.size(); ++i) cast(i);
-    std::vector<std::uint8_t> result(points_.size(), 0);
     for (std::size_t i = 0; i < points_.size(); ++i) {
-      if (!inImage(points_.u[i], points_.v[i], camera_.imageSize())) continue;
-      const int x = pixelIndex(points_.u[i]) / cell_x_, y = pixelIndex(points_.v[i]) / cell_y_;
-      const float nearness = column(x)[y];
-      const double near = 1.0 / static_cast<double>(nearness);
-      const double margin = std::max(config_.depth_margin_m, config_.depth_margin_ratio * near);
-      result[i] = nearness > 0.0f && points_.distance[i] > near + margin ? 0 : 1;
+      if (!inImage(points_.u[i], points_.v[i], camera_.imageSize())) visible_[i] = 0;
     }
-    return result;
+    return std::move(visible_);
   }
 
  private:
@@ -73,62 +121,62 @@ class SurfaceMasks {
     float nearness = 0;
   };
 
-  float* column(int x) {
-    return nearness_.data() + static_cast<std::size_t>(x) * static_cast<std::size_t>(rows_);
-  }
-
   Sample sampleOf(std::size_t i) const {
     return {{points_.u[i], points_.v[i]}, 1.0f / std::max(points_.distance[i], 1e-3f)};
   }
 
-  std::optional<Sample> sampleAt(const Eigen::Vector3d& p_lidar) const {
-    const Eigen::Vector3d p_camera = T_camera_lidar_ * p_lidar;
-    const auto pixel = camera_.project(p_camera);
-    if (!pixel) return std::nullopt;
-    const double distance = (p_camera - camera_.opticalCentre()).norm();
-    return Sample{pixel->cast<float>(), static_cast<float>(1.0 / std::max(distance, 1e-3))};
-  }
-
-  Eigen::Vector3d point(std::int32_t i) const {
+  Eigen::Vector3f point(std::int32_t i) const {
     const auto k = static_cast<std::size_t>(i);
     return {cloud_.x[k], cloud_.y[k], cloud_.z[k]};
   }
 
-  /// Half-way to a neighbour on the same surface. Inverse distance is linear in the image on a
-  /// plane.
-  Arm armTo(const Sample& own, std::int32_t link) const {
+  /// An arm to a point in the lidar's frame, of which `part` is taken; none if it has no pixel.
+  /// Inverse distance is linear in the image on a plane.
+  Arm armToPoint(const Sample& own, const Eigen::Vector3f& p_lidar, float part) const {
+    const Eigen::Vector3d p_camera = T_camera_lidar_ * p_lidar.cast<double>();
+    const auto pixel = camera_.project(p_camera);
+    if (!pixel) return {Eigen::Vector2f::Zero(), own.nearness};
+    const double distance = std::max((p_camera - camera_.opticalCentre()).norm(), 1e-3);
+    const float nearness = static_cast<float>(1.0 / distance);
+    return {part * (pixel->cast<float>() - own.pixel),
+            own.nearness + part * (nearness - own.nearness)};
+  }
+
+  /// Half-way to a neighbour on the same surface.
+  Arm armToLink(const Sample& own, std::int32_t link) const {
     const std::int32_t slot = slot_[static_cast<std::size_t>(link)];
-    const std::optional<Sample> other =
-        slot >= 0 ? sampleOf(static_cast<std::size_t>(slot)) : sampleAt(point(link));
-    if (!other) return {Eigen::Vector2f::Zero(), own.nearness};
-    return {0.5f * (other->pixel - own.pixel), 0.5f * (other->nearness + own.nearness)};
+    if (slot < 0) return armToPoint(own, point(link), 0.5f);
+    const Sample other = sampleOf(static_cast<std::size_t>(slot));
+    return {0.5f * (other.pixel - own.pixel), 0.5f * (other.nearness + own.nearness)};
   }
 
   /// To where the surface may end, turned from the beam by the given angles (one of them is 0). It
   /// goes on straight from the neighbour `opposite`, or else at the same range.
-  Arm armToEdge(const Sample& own, std::int32_t self, std::int32_t opposite, double azimuth_rad,
-                double elevation_rad) const {
-    const Eigen::Vector3d p = point(self);
-    const double range = p.norm(), flat = std::hypot(p.x(), p.y());
-    const double azimuth = std::atan2(p.y(), p.x()) + azimuth_rad;
-    const double elevation = std::atan2(p.z(), flat) + elevation_rad;
-    double inverse = 1.0 / range;
+  Arm armToEdge(const Sample& own, std::int32_t self, std::int32_t opposite, float azimuth_rad,
+                float elevation_rad) const {
+    const Eigen::Vector3f p = point(self);
+    const float range = p.norm(), flat = std::max(p.head<2>().norm(), 1e-6f);
+    float scale = 1.0f;  // of the range
     if (opposite != BeamGrid::kNoLink) {
-      const Eigen::Vector3d q = point(opposite);
-      const double between = std::atan2(p.cross(q).norm(), p.dot(q));
-      const double reach = std::hypot(azimuth_rad * flat / range, elevation_rad);
+      const Eigen::Vector3f q = point(opposite);
+      const float range_q = q.norm();
+      const float between = p.cross(q).norm() / (range * range_q);
+      const float reach = std::abs(azimuth_rad) * flat / range + std::abs(elevation_rad);
       // No nearer than the margin, so that noise makes no near mask; no farther than four times.
-      const double margin = std::max(config_.depth_margin_m, config_.depth_margin_ratio * range);
-      const double most = 1.0 / std::max(0.5 * range, range - margin);
-      if (between > 1e-6) inverse += (1.0 / range - 1.0 / q.norm()) * reach / between;
-      inverse = std::min(std::max(inverse, 0.25 / range), most);
+      const float margin = std::max(margin_m_, margin_ratio_ * range);
+      const float most = range / std::max(0.5f * range, range - margin);
+      float inverse = 1.0f;
+      if (between > 1e-6f) inverse += (1.0f - range / range_q) * reach / between;
+      scale = 1.0f / std::min(std::max(inverse, 0.25f), most);
     }
-    const auto end =
-        sampleAt(Eigen::Vector3d(std::cos(elevation) * std::cos(azimuth),
-                                 std::cos(elevation) * std::sin(azimuth), std::sin(elevation)) /
-                 inverse);
-    if (!end) return {Eigen::Vector2f::Zero(), own.nearness};
-    return {end->pixel - own.pixel, end->nearness};
+    // Angles of a beam: two terms of sine and cosine are exact to 1e-5.
+    const float a = azimuth_rad * (1.0f - azimuth_rad * azimuth_rad / 6.0f);
+    const float e = elevation_rad * (1.0f - elevation_rad * elevation_rad / 6.0f);
+    const float cos_a = 1.0f - 0.5f * azimuth_rad * azimuth_rad;
+    const float cos_e = 1.0f - 0.5f * elevation_rad * elevation_rad;
+    const Eigen::Vector3f turned(cos_a * p.x() - a * p.y(), cos_a * p.y() + a * p.x(), p.z());
+    const Eigen::Vector3f up(-p.z() * p.x() / flat, -p.z() * p.y() / flat, flat);
+    return armToPoint(own, scale * (cos_e * turned + e * up), 1.0f);
   }
 
   void cast(std::size_t i) {
@@ -140,80 +188,65 @@ class SurfaceMasks {
     const auto self = static_cast<std::int32_t>(index);
     const bool lone = links.up == kNone && links.down == kNone;
     const bool alone = lone && links.left == kNone && links.right == kNone;
-    const double tall = 2.0 * (lone ? kLoneReach : kEdgeReach);
-    const double wide = 2.0 * (alone ? kLoneReach : kEdgeReach) * ring.half_azimuth_rad;
+    const float wide =
+        2.0f * (alone ? kLoneReach : kEdgeReach) * static_cast<float>(ring.half_azimuth_rad);
+    const float tall = 2.0f * (lone ? kLoneReach : kEdgeReach);
+    const float high = tall * static_cast<float>(ring.half_up_rad);
+    const float low = tall * static_cast<float>(ring.half_down_rad);
     const Sample own = sampleOf(i);
-    const Arm left =
-        links.left != kNone ? armTo(own, links.left) : armToEdge(own, self, links.right, wide, 0.0);
-    const Arm right = links.right != kNone ? armTo(own, links.right)
-                                           : armToEdge(own, self, links.left, -wide, 0.0);
-    const Arm up = links.up != kNone
-                       ? armTo(own, links.up)
-                       : armToEdge(own, self, links.down, 0.0, tall * ring.half_up_rad);
-    const Arm down = links.down != kNone
-                         ? armTo(own, links.down)
-                         : armToEdge(own, self, links.up, 0.0, -tall * ring.half_down_rad);
+    const Arm left = links.left != kNone ? armToLink(own, links.left)
+                                         : armToEdge(own, self, links.right, wide, 0.0f);
+    const Arm right = links.right != kNone ? armToLink(own, links.right)
+                                           : armToEdge(own, self, links.left, -wide, 0.0f);
+    const Arm up =
+        links.up != kNone ? armToLink(own, links.up) : armToEdge(own, self, links.down, 0.0f, high);
+    const Arm down = links.down != kNone ? armToLink(own, links.down)
+                                         : armToEdge(own, self, links.up, 0.0f, -low);
     castHalf(own, left, right, up);
     castHalf(own, left, right, down);
   }
 
-  /// Enters the parallelogram from the left to the right arm's end, swept along the arm `along`,
-  /// rounded outwards by half a pixel.
+  /// Hides what lies behind the parallelogram from the left to the right arm's end, swept along the
+  /// arm `along`.
   void castHalf(const Sample& own, const Arm& left, const Arm& right, const Arm& along) {
     const Eigen::Vector2f across = 0.5f * (right.offset - left.offset);
     const Eigen::Vector2f centre = own.pixel + 0.5f * (right.offset + left.offset);
+    const float s_gain = 0.5f * (right.nearness - left.nearness);
+    const float t_gain = along.nearness - own.nearness;
+    const float least = std::min(own.nearness, along.nearness) - std::abs(s_gain);
+    const float most = std::max(own.nearness, along.nearness) + std::abs(s_gain);
+    const float nearest = hiddenBeyond(most);
+
     // Pixel = centre + s * across + t * along, s in -1..1, t in 0..1
     const float det = across.x() * along.offset.y() - across.y() * along.offset.x();
     if (!(std::abs(det) >= 1e-3f * (across.norm() + along.offset.norm()))) return;  // edge-on
     const float s_x = along.offset.y() / det, s_y = -along.offset.x() / det;
     const float t_x = -across.y() / det, t_y = across.x() / det;
-    const float s_slack = 0.5f * (std::abs(s_x) + std::abs(s_y));
-    const float t_slack = 0.5f * (std::abs(t_x) + std::abs(t_y));
+    const float s_most = 1.0f + kSlack_px * (std::abs(s_x) + std::abs(s_y));
+    const float t_slack = kSlack_px * (std::abs(t_x) + std::abs(t_y));
 
-    const float s_gain = 0.5f * (right.nearness - left.nearness);
-    const float t_gain = along.nearness - own.nearness;
-    const float gain_y = s_gain * s_y + t_gain * t_y;
-    const float least = std::min(own.nearness, along.nearness) - std::abs(s_gain);
-    const float most = std::max(own.nearness, along.nearness) + std::abs(s_gain);
-
-    // A cell stands for its middle.
-    const float cell_x = static_cast<float>(cell_x_), cell_y = static_cast<float>(cell_y_);
-    const float middle_x = 0.5f * (cell_x - 1.0f), middle_y = 0.5f * (cell_y - 1.0f);
-    const float x_low = centre.x() - std::abs(across.x()) + std::min(0.0f, along.offset.x()) - 1.0f;
-    const float x_high =
-        centre.x() + std::abs(across.x()) + std::max(0.0f, along.offset.x()) + 1.0f;
-    const int x_begin = toCell((x_low - middle_x) / cell_x, columns_);
-    const int x_end = toCell((x_high - middle_x) / cell_x + 1.0f, columns_);
-    for (int x = x_begin; x < x_end; ++x) {
-      const float dx = static_cast<float>(x) * cell_x + middle_x - centre.x();
-      float low = -1e6f, high = 1e6f;
-      clip(s_x * dx, s_y, -1.0f - s_slack, 1.0f + s_slack, &low, &high);
-      clip(t_x * dx, t_y, -t_slack, 1.0f + t_slack, &low, &high);
-      const float zero = centre.y() - middle_y;
-      const int y_begin = toCell(std::ceil((zero + low) / cell_y), rows_);
-      const int y_end = toCell(std::floor((zero + high) / cell_y) + 1.0f, rows_);
-      const float at_zero = own.nearness + s_gain * s_x * dx + t_gain * t_x * dx - gain_y * zero;
-      float* cells = column(x);
-      for (int y = y_begin; y < y_end; ++y) {
-        const float nearness = at_zero + gain_y * cell_y * static_cast<float>(y);
-        cells[y] = std::max(cells[y], std::min(most, std::max(least, nearness)));
-      }
-    }
+    const float wide = std::abs(across.x()) + 2.0f * kSlack_px;
+    const float high = std::abs(across.y()) + 2.0f * kSlack_px;
+    tiles_.visit(centre.x() - wide + std::min(0.0f, along.offset.x()),
+                 centre.x() + wide + std::max(0.0f, along.offset.x()),
+                 centre.y() - high + std::min(0.0f, along.offset.y()),
+                 centre.y() + high + std::max(0.0f, along.offset.y()), nearest,
+                 [&](const Tiles::Point& point) {
+                   if (!(point.distance > nearest)) return;
+                   const float du = point.u - centre.x(), dv = point.v - centre.y();
+                   const float s = s_x * du + s_y * dv, t = t_x * du + t_y * dv;
+                   if (std::abs(s) > s_most || t < -t_slack || t > 1.0f + t_slack) return;
+                   const float nearness =
+                       std::min(most, std::max(least, own.nearness + s_gain * s + t_gain * t));
+                   if (point.distance > hiddenBeyond(nearness)) visible_[point.place] = 0;
+                 });
   }
 
-  static int toCell(float at, int count) {
-    return static_cast<int>(std::max(0.0f, std::min(at, static_cast<float>(count))));
-  }
-
-  /// Narrows low..high to the y at which start + slope * y lies in least..most.
-  static void clip(float start, float slope, float least, float most, float* low, float* high) {
-    if (std::abs(slope) < 1e-9f) {
-      if (!(start >= least && start <= most)) *high = *low - 1.0f;
-      return;
-    }
-    const float a = (least - start) / slope, b = (most - start) / slope;
-    *low = std::max(*low, std::min(a, b));
-    *high = std::min(*high, std::max(a, b));
+  /// Distance from which a mask of 1 / distance `nearness` hides; never if that is not positive.
+  float hiddenBeyond(float nearness) const {
+    if (!(nearness > 0.0f)) return std::numeric_limits<float>::max();
+    const float near = 1.0f / nearness;
+    return near + std::max(margin_m_, margin_ratio_ * near);
   }
 
   const Cloud& cloud_;
@@ -221,11 +254,10 @@ class SurfaceMasks {
   const Transform& T_camera_lidar_;
   const CameraModel& camera_;
   const BeamGrid& grid_;
-  const OcclusionConfig& config_;
+  float margin_m_, margin_ratio_;
+  Tiles tiles_;
   std::vector<std::int32_t> slot_;  ///< by cloud index: place in `points_`, -1 = none
-  int cell_x_ = 1, cell_y_ = 1;     ///< px
-  int columns_ = 0, rows_ = 0;
-  std::vector<float> nearness_;  ///< largest 1 / distance of a mask per cell, columns contiguous
+  std::vector<std::uint8_t> visible_;
 };
 
 }  // namespace

@@ -29,10 +29,8 @@ constexpr double kPositionWeight = 2.5;
 constexpr double kReach = 0.75;
 // An iteration visits every kRowStep-th row, each time others.
 constexpr int kRowStep = 4;
-// Clusters rest once they move by less than this share of a cell, on average over them. A warm
-// start leaves more to the images to come.
-constexpr double kColdRest = 0.06;
-constexpr double kWarmRest = 0.1;
+// Clusters rest once they move by less than this share of a cell, on average over them.
+constexpr double kRest = 0.06;
 // An image is of another scene if its distances from the clusters of the image before are this much
 // larger than that one's own: by a factor, and by a number of grey levels per pixel.
 constexpr double kSceneCutFactor = 1.4;
@@ -104,10 +102,10 @@ class Slic::Engine {
       started_warm_ = !isSceneCut(last_residual);
     }
     if (started_warm_) {
-      settle(kWarmRest, 1);
+      settle(1);
     } else {
       seed();
-      settle(kColdRest, 0);
+      settle(0);
     }
     has_last_ = true;
     last_stamp_ = stamp;
@@ -254,8 +252,8 @@ class Slic::Engine {
   }
 
   /// Iterates until the clusters rest, `done` times having been spent.
-  void settle(double rest, int done) {
-    const double tolerated = rest * grid_.cell * static_cast<double>(clusters_.size());
+  void settle(int done) {
+    const double tolerated = kRest * grid_.cell * static_cast<double>(clusters_.size());
     for (int i = done; i < config_.iterations; ++i) {
       if (i > 0 && static_cast<double>(moved_) < tolerated) return;
       iterate(i);

@@ -10,8 +10,9 @@ master of its own. Rows:
   tcp         the player is another process: JPEG images, everything passes over TCP
 
 A scan counts as lost if no cloud comes out, or one without a point of every camera. The latency is
-from the moment that the scan, its odometry and the scores of its images are delivered to the arrival
-of the cloud. The CPU time is that of the process less what the player uses when nobody listens.
+from the moment that the scan, its odometry and the scores of its images are delivered until the cloud
+is there. The CPU time is that of the process less what the player uses: playing to nobody, and copies
+of messages that are still held when they are to be played again.
 """
 
 import argparse
@@ -27,7 +28,7 @@ import tempfile
 SCAN_PERIOD = 0.1
 WARM_UP = 2.0  # s at the start that do not count
 SUPERPIXEL_WIDTH = 640
-GOALS = {"cpu_ms_per_scan": (50.0, 25.0), "latency_ms_median": (30.0, 30.0), "scans_lost": (0, 0)}
+GOALS = {"cpu_ms_per_scan": (50.0, 25.0)}  # must, aim
 
 
 def fail(text):
@@ -106,6 +107,7 @@ def quantile(values, share):
 
 
 def between(samples, begin, end):
+    """Those whose moment, their first entry, lies between two."""
     return [s for s in samples if begin <= s[0] <= end]
 
 
@@ -118,8 +120,8 @@ def cpu_per_scan(log, begin, end):
     return 1e-6 * (samples[-1][1] - samples[0][1]) / seconds * SCAN_PERIOD
 
 
-def evaluate(manager, player_log, alone):
-    """One row of figures from the logs of the manager and of the player."""
+def evaluate(manager, player_log, alone, shared):
+    """One row of figures from the logs of manager and player; `shared`: they are one process."""
     player = player_log["player"]
     begin = player["start"] + int(1e9 * WARM_UP)
     deliveries = player["deliveries"]
@@ -153,16 +155,20 @@ def evaluate(manager, player_log, alone):
         fused.append(result[3])
     samples = between(manager["samples"], begin, end)
     total = cpu_per_scan(manager, begin, end)
+    # The copies that the player makes of messages which are still held are its own affair.
+    copies = between(player["copies"], samples[0][0], samples[-1][0])
+    periods = 1e-9 * (samples[-1][0] - samples[0][0]) / SCAN_PERIOD
+    playing = alone + 1e3 * sum(c[1] for c in copies) / periods if shared else 0.0
     return {
-        "cpu_ms_per_scan": total - alone,
-        "player_ms_per_scan": alone,
+        "cpu_ms_per_scan": total - playing,
+        "player_ms_per_scan": playing,
         "latency_ms_median": quantile(latencies, 0.5),
         "latency_ms_p99": quantile(latencies, 0.99),
         "resident_mb": 1e-6 * (max(s[2] for s in samples) - manager["resident_before"]),
         "scans": len(counted),
         "scans_lost": lost,
         "fused_points_per_scan": quantile(fused, 0.5),
-        "copies_by_player": player["copies"],
+        "copies_by_player": len(copies),
         "largest_lag_of_player_ms": 1e-6 * player["largest_lag_ns"],
     }
 
@@ -209,7 +215,7 @@ def run(arguments, folder):
                 latency,
             )
             result = finish(process, log)
-            rows[name] = evaluate(result, result, alone["raw"])
+            rows[name] = evaluate(result, result, alone["raw"], True)
             if arguments.logs:
                 shutil.copy(log, os.path.join(arguments.logs, name + ".json"))
         if "tcp" in arguments.rows:
@@ -218,7 +224,7 @@ def run(arguments, folder):
                 program, environment, "player", rigs["compressed"], other, *play, seconds
             )
             played = finish(player, other)
-            rows["tcp"] = evaluate(finish(manager, log), played, 0.0)
+            rows["tcp"] = evaluate(finish(manager, log), played, 0.0, False)
     return {"image_width": width, "seconds": arguments.seconds, "rows": rows, "goals": GOALS}
 
 

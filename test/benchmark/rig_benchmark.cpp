@@ -221,9 +221,14 @@ void writeLog(const std::string& path, std::int64_t resident_before, const Monit
   out << "]";
   if (player != nullptr) {
     out << ",\n\"player\": {\"start\": " << player->startSteadyNs()
-        << ", \"scans\": " << player->scanCount() << ", \"copies\": " << player->copyCount()
-        << ", \"thread_cpu_s\": " << player->threadCpuSeconds()
-        << ", \"largest_lag_ns\": " << player->largestLagNs() << ", \"deliveries\": [";
+        << ", \"scans\": " << player->scanCount()
+        << ", \"largest_lag_ns\": " << player->largestLagNs() << ", \"copies\": [";
+    comma = "";
+    for (const Copy& copy : player->copies()) {
+      out << comma << "[" << copy.steady_ns << "," << copy.cpu_s << "]";
+      comma = ",\n";
+    }
+    out << "], \"deliveries\": [";
     comma = "";
     for (const Delivery& delivery : player->deliveries()) {
       out << comma << "[\"" << delivery.what << "\"," << delivery.stamp << "," << delivery.until

@@ -207,7 +207,6 @@ void RigPlayer::awaitListeners() const {
 
 void RigPlayer::play() {
   if (options_.wait_for_listeners) awaitListeners();
-  const double cpu_start = semantic_lidar_fusion::threadCpuSeconds();
   constexpr StampNs kLead = 300000000;
   start_steady_ns_ = steadyNs() + kLead;
   const StampNs start = stampNs(ros::Time::now()) + kLead;
@@ -223,15 +222,15 @@ void RigPlayer::play() {
     }
     motion_so_far_ = round_motion_ * motion_so_far_;
   }
-  thread_cpu_s_ = semantic_lidar_fusion::threadCpuSeconds() - cpu_start;
 }
 
 /// The message itself if nobody else holds it, else a copy that takes its place.
 template <class M>
 boost::shared_ptr<M> RigPlayer::owned(boost::shared_ptr<M>* message) {
   if (message->use_count() > 1) {
-    ++copy_count_;
+    const double cpu_start = threadCpuSeconds();
     *message = boost::make_shared<M>(**message);
+    copies_.push_back({steadyNs(), threadCpuSeconds() - cpu_start});
   }
   return *message;
 }
@@ -286,8 +285,10 @@ void RigPlayer::publishImage(Camera* camera, const Event& event, StampNs stamp) 
     }
     if (message == nullptr) {  // all are waiting for a scan to choose them
       using Message = typename std::decay_t<decltype(*fillers)>::value_type::element_type;
+      const double cpu_start = threadCpuSeconds();
       fillers->push_back(boost::make_shared<Message>(*images->front().message));
       message = &fillers->back();
+      copies_.push_back({steadyNs(), threadCpuSeconds() - cpu_start});
     }
     const auto image = owned(message);
     image->header.stamp = rosTime(stamp);

@@ -34,6 +34,12 @@ struct Delivery {
   std::int64_t steady_ns;
 };
 
+/// A message that was copied since others still held it.
+struct Copy {
+  std::int64_t steady_ns;
+  double cpu_s;
+};
+
 /// A message is published as the pointer that holds it, and again in the next round once nobody
 /// else does, so that playing costs next to nothing. Images that no scan uses are fillers of the
 /// same size.
@@ -46,8 +52,8 @@ class RigPlayer {
 
   const std::vector<Delivery>& deliveries() const { return deliveries_; }
   int scanCount() const { return scan_count_; }
-  int copyCount() const { return copy_count_; }
-  double threadCpuSeconds() const { return thread_cpu_s_; }
+  /// What copies took: all that playing costs beyond what it costs without listeners.
+  const std::vector<Copy>& copies() const { return copies_; }
   std::int64_t startSteadyNs() const { return start_steady_ns_; }
   std::int64_t largestLagNs() const { return largest_lag_ns_; }
 
@@ -96,8 +102,8 @@ class RigPlayer {
   ros::NodeHandle node_;
   ros::Publisher scan_publisher_, tf_publisher_, static_tf_publisher_;
   std::vector<Delivery> deliveries_;
-  int scan_count_ = 0, copy_count_ = 0;
-  double thread_cpu_s_ = 0;
+  std::vector<Copy> copies_;
+  int scan_count_ = 0;
   std::int64_t start_steady_ns_ = 0, largest_lag_ns_ = 0;
 };
 

@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: MIT
 /// Clusters images that come on standard input, for comparisons with libraries of other languages.
 ///
-/// Each request is a line "width height count mode" (mode: cold, warm = start from the request before
-/// with the same count, or first = of a sequence whose next ones are warm), then width * height * 3 bytes BGR. The answer is a line "CPU-milliseconds superpixels",
-/// then width * height 32-bit ids in the machine's byte order. Ends at the end of input.
+/// Each request is a line "width height count mode", then width * height * 3 bytes BGR. Modes:
+/// cold; warm = start from the request before with the same count; first = of a sequence whose next
+/// ones are warm. The answer is a line "CPU-milliseconds superpixels", then width * height 32-bit
+/// ids in the machine's byte order. Ends at the end of input.
 #include <time.h>
 
 #include <cstdio>

@@ -378,10 +378,20 @@ class ReplayCase(unittest.TestCase):
             self.assertEqual(difference(message, offline), "")
 
     def assert_replay_gives(
-        self, expected, bag, rig, overrides, topics, rate=RATE, network=None, **arguments
+        self,
+        expected,
+        bag,
+        rig,
+        overrides,
+        topics,
+        rate=RATE,
+        network=None,
+        before_the_end=lambda: None,
+        **arguments,
     ):
         """Plays `bag` when all of `topics` have listeners and the external network, if there is
-        one, is connected. Returns the clouds that came."""
+        one, is connected. Returns the clouds that came. `before_the_end` is called before the
+        nodes end."""
         semantic = Received("/points_semantic", PointCloud2)
         try:
             with launched(
@@ -399,6 +409,7 @@ class ReplayCase(unittest.TestCase):
                     network.wait_until_connected()
                 resume()
                 received = semantic.wait_for(len(expected), timeout=60.0)
+                before_the_end()
         finally:
             semantic.close()
         self.assert_same(expected, received)
@@ -459,6 +470,6 @@ class Said:
             lines = list(self._lines)
         return [line for line in lines if line[0] >= level and re.search(pattern, line[2])]
 
-    def wait_for(self, pattern, level=Log.WARN, timeout=20.0):
+    def wait_for(self, pattern, level=Log.WARN, timeout=60.0):
         with_text = lambda: "a line like '%s'; said: %s" % (pattern, self._lines)  # noqa: E731
         return wait_until(lambda: self.find(pattern, level), with_text, timeout)

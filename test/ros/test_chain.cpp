@@ -14,6 +14,7 @@
 #include <tf2_msgs/TFMessage.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cstring>
 #include <fstream>
 #include <functional>
@@ -314,6 +315,13 @@ struct Lazy {
   std::vector<std::string> images, clouds, times;
 };
 
+/// Nodelet and output as a name.
+std::string nameOf(const Lazy& lazy) {
+  std::string name = std::string(lazy.type) + "_" + lazy.output;
+  std::replace(name.begin(), name.end(), '/', '_');
+  return name;
+}
+
 class Laziness : public testing::TestWithParam<Lazy> {};
 
 TEST_P(Laziness, SubscribesOnlyWhileListenedTo) {
@@ -327,7 +335,7 @@ TEST_P(Laziness, SubscribesOnlyWhileListenedTo) {
                                              "classes: {road: [0], wall: [1], sky: [2]}\n";
     extra = "segmentation: {model: model.yaml}\n";
   }
-  Chain chain(std::string("lazy_") + lazy.type, {lazy.type}, rigFile(folder, extra));
+  Chain chain("lazy_" + nameOf(lazy), {lazy.type}, rigFile(folder, extra));
   ros::NodeHandle& node = chain.node();
   std::vector<ros::Publisher> inputs;
   for (const auto& topic : lazy.images)
@@ -376,6 +384,41 @@ INSTANTIATE_TEST_SUITE_P(
              {"front/image_selected", "front/scores"},
              {},
              {}},
+        Lazy{"SuperpixelUncertainty",
+             "front/superpixels",
+             true,
+             false,
+             {"front/image_selected", "front/scores"},
+             {},
+             {}},
+        Lazy{"SuperpixelUncertainty",
+             "left/probabilities",
+             true,
+             false,
+             {"left/image_selected", "left/scores"},
+             {},
+             {}},
+        Lazy{"SuperpixelUncertainty",
+             "left/uncertainty_overlay",
+             true,
+             false,
+             {"left/image_selected", "left/scores"},
+             {},
+             {}},
+        Lazy{"ImageSelection",
+             "left/image_selected",
+             true,
+             false,
+             {"front/image", "left/image"},
+             {"points"},
+             {}},
+        Lazy{"Projection",
+             "left/projection_overlay",
+             true,
+             false,
+             {"front/scores", "front/share", "left/scores", "left/share", "left/image_selected"},
+             {"points_compensated"},
+             {"front/selection", "left/selection", "scan_reference"}},
         Lazy{"MotionCompensation",
              "points_compensated",
              false,
@@ -390,7 +433,7 @@ INSTANTIATE_TEST_SUITE_P(
              {"front/scores", "front/share", "left/scores", "left/share"},
              {"points_compensated"},
              {"front/selection", "left/selection", "scan_reference"}}),
-    [](const testing::TestParamInfo<Lazy>& info) { return std::string(info.param.type); });
+    [](const testing::TestParamInfo<Lazy>& info) { return nameOf(info.param); });
 
 TEST(Laziness, ALastListenerStopsTheWholeChain) {
   const std::string folder = temporaryFolder();

@@ -32,6 +32,20 @@ class Start(unittest.TestCase):
                     self.said.wait_for(key, Log.FATAL)
                 self.assertTrue(live.pid_of(live.MANAGER))
 
+    def test_a_file_that_is_no_yaml_is_told_with_its_line(self):
+        with live.folder() as path:
+            rig = os.path.join(path, "rig.yaml")
+            with open(rig, "w") as file:
+                file.write("name: broken\ncameras: [{name: front}\nlidar: {input: points}\n")
+            with live.launched("fusion.launch", rig=rig, bond="false"):
+                self.said.wait_for(r"rig\.yaml:3:\d+: is not YAML", Log.FATAL)
+                self.assertTrue(live.pid_of(live.MANAGER))
+
+    def test_a_rig_file_that_is_not_there_is_named(self):
+        with live.launched("fusion.launch", rig="/nowhere/rig.yaml", bond="false"):
+            self.said.wait_for(r"/nowhere/rig\.yaml: cannot be read", Log.FATAL)
+            self.assertTrue(live.pid_of(live.MANAGER))
+
     def test_a_missing_topic_is_named_with_one_that_looks_like_it(self):
         with live.folder() as path:
             made = live.Made(path, Drive(scans=1, points_per_scan=160))

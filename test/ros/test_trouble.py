@@ -4,18 +4,23 @@
 
 One manager serves all cases, in the order of their names; its process id must not change.
 """
+import json
 import os
 import sys
 import unittest
 
 import rospy
 import rostest
+import yaml
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 import live  # noqa: E402
-from bag_factory import Drive, read_cloud  # noqa: E402
+from bag_factory import CLASS_NAMES, Drive, read_cloud  # noqa: E402
 from rosgraph_msgs.msg import Log  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+NODELETS = ("image_selection", "superpixel_uncertainty", "motion_compensation", "projection")
 
 
 class Trouble(unittest.TestCase):
@@ -183,14 +188,24 @@ class Trouble(unittest.TestCase):
         self.assert_good()
 
     def test_10_every_nodelet_reports(self):
-        names = ("image_selection", "superpixel_uncertainty", "motion_compensation", "projection")
         live.wait_until(
             lambda: all(
                 any("rate (Hz)" in key for key in self.diagnostics.values.get(name, ()))
-                for name in names
+                for name in NODELETS
             ),
-            lambda: "diagnostics of %s; came: %s" % (names, sorted(self.diagnostics.values)),
+            lambda: "diagnostics of %s; came: %s" % (NODELETS, sorted(self.diagnostics.values)),
         )
+
+    def test_11_what_is_latched_comes_to_those_who_ask_late(self):
+        info = json.loads(rospy.wait_for_message("/class_info", String, 20.0).data)
+        self.assertEqual([c["name"] for c in info["classes"]], list(CLASS_NAMES))
+        for nodelet in NODELETS:
+            text = rospy.wait_for_message("/%s/configuration" % nodelet, String, 20.0).data
+            known = yaml.safe_load(text)
+            self.assertRegex(known["version"], r"^\d+\.\d+\.\d+$")
+            self.assertEqual(known["name"], "room")
+            # Of an override, not of the file.
+            self.assertEqual(float(known["reference"]["timeout"]), 3.0)
 
 
 if __name__ == "__main__":

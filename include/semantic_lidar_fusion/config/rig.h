@@ -99,8 +99,9 @@ struct SegmentationConfig {
 };
 
 struct Rig {
-  std::string name;                   ///< default: the rig file's, without extension
-  LabelSet classes;                   ///< key `classes`: {file: PATH}, a path or a set in place
+  std::string yaml;  ///< what it was read from, overrides applied; keys left out have their default
+  std::string name;  ///< default: the rig file's, without extension
+  LabelSet classes;  ///< key `classes`: {file: PATH}, a path or a set in place
   std::vector<CameraConfig> cameras;  ///< at most 16; the position is the bit in `cameras`
   LidarConfig lidar;
   std::string fixed_frame = "odom";

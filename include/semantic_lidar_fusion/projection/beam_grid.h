@@ -29,7 +29,7 @@ struct BeamGrid {
   double vertical_step_rad = 0;  ///< median over rings
   double horizontal_step_rad = 0;
   /// Adaptive only, by cloud index: the ring (a made-up one if the cloud has none; kNoRing for
-  /// points that cast no mask) and the links.
+  /// points that cast no mask) the links.
   std::vector<std::uint16_t> ring;
   std::vector<Links> links;
 };

@@ -7,10 +7,10 @@
 /// opposite side, or else at the point's range; half of the way up and down if it has a neighbour
 /// on its surface neither above nor below, and to all sides if it has none at all. Two returns lie
 /// on one surface if their ranges are close, or (ground at a grazing angle) if the surface goes on
-/// straight. A point is hidden iff d > d_near + max(depth_margin_m, depth_margin_ratio * d_near),
-/// d_near = the nearest mask on its pixel. So ground does not hide itself, however far the camera
-/// is from the lidar. All points cast, also from outside the image; where masks are tall they are
-/// sampled every few pixels along their height.
+/// straight; returns that are missing between them (glass, dark paint) are bridged. A point is
+/// hidden iff d > d_near + max(depth_margin_m, depth_margin_ratio * d_near), d_near = the nearest
+/// mask where it is in the image. So ground does not hide itself, however far the camera is from
+/// the lidar. All points cast, also from outside the image.
 #pragma once
 
 #include <cstdint>

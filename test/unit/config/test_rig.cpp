@@ -445,6 +445,17 @@ TEST(OverrideTest, LeavesTheCallersTreeAndAliasesAlone) {
   EXPECT_EQ(rigFromYaml(tree, kConfigFolder, "r").cameras[0].timeout_s, 0.1);
 }
 
+TEST(OverrideTest, IsInTheTreeThatTheRigKeeps) {
+  const Rig rig = parse(kTwoCameras, {"cameras.right.timeout=0.75", "overlap=product"});
+  const YAML::Node kept = YAML::Load(rig.yaml);
+  EXPECT_EQ(kept["overlap"].as<std::string>(), "product");
+  EXPECT_EQ(kept["cameras"][1]["timeout"].as<double>(), 0.75);
+  const Rig again = rigFromYaml(kept, kConfigFolder, "rig.yaml");
+  EXPECT_EQ(again.overlap, rig.overlap);
+  EXPECT_EQ(again.cameras[1].timeout_s, 0.75);
+  EXPECT_EQ(again.yaml, rig.yaml);
+}
+
 TEST(OverrideTest, NamesWhatIsWrong) {
   const auto problem = [](const std::string& text) { return problemOf(kTwoCameras, {text}); };
   EXPECT_EQ(problem("overlap"), "override 'overlap': must be key=value");
