@@ -10,6 +10,7 @@
 
 #include "parameters.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -131,10 +132,13 @@ StampNs FusionNodelet::now() const {
   const auto clock_ns = static_cast<StampNs>(ros::Time::now().toNSec());
   std::lock_guard<std::mutex> lock(clock_mutex_);
   if (clock_ns != clock_ns_) {
+    // A jump is no time that passes: no deadline is due because of it.
+    const StampNs step_ns = clock_ns - clock_ns_;
+    if (step_ns > 0 && step_ns < EpochMonitor::kForwardNs) elapsed_ns_ += step_ns;
     clock_ns_ = clock_ns;
     clock_changed_ns_ = steady_ns;
   }
-  return clock_ns + std::max<StampNs>(0, steady_ns - clock_changed_ns_ - kClockStall);
+  return elapsed_ns_ + std::max<StampNs>(0, steady_ns - clock_changed_ns_ - kClockStall);
 }
 
 void FusionNodelet::guard(const std::string& where, const std::function<void()>& work) {
