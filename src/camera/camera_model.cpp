@@ -333,6 +333,7 @@ CameraModel::CameraModel(const CameraInfo& info, const CameraModelOptions& optio
     cx_ = (info.k[2] - info.roi_x) / reduction.binning_x;
     cy_ = (info.k[5] - info.roi_y) / reduction.binning_y;
     if (distortion_ == DistortionModel::kEquidistant) skew_ = info.k[1] / info.k[0];
+    if (!std::isfinite(skew_)) refuse(info, "K[1]", info.k[1], "must be finite as K[1] / K[0]");
   }
 
   const double limit = max_theta_deg > 0.0 ? max_theta_deg * kPi / 180.0 : kPi;

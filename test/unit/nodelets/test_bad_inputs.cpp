@@ -125,6 +125,9 @@ void cameraInfoCases(std::vector<Case>* cases) {
   add(
       "K of zeros", kFisheye, false, [](Info& i) { i.K.fill(0); }, "K[0]");
   add(
+      "skew beyond all numbers", kFisheye, false, [](Info& i) { i.K[0] = 1e-300, i.K[1] = 1e20; },
+      "K[1]");
+  add(
       "fy of zero", kFisheye, false, [](Info& i) { i.K[4] = 0; }, "K[4]");
   add(
       "fx negative", kFisheye, false, [](Info& i) { i.K[0] = -300; }, "K[0]");
