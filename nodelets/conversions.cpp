@@ -182,7 +182,7 @@ template <typename T>
 void readField(const sensor_msgs::PointCloud2& message, const FieldLayout& wanted,
                std::vector<T>* values) {
   const PointField* field = findField(message, wanted);
-  if (!field) return;
+  if (!field || values->empty()) return;
   std::size_t i = 0;
   for (std::uint32_t row = 0; row < message.height; ++row) {
     const std::uint8_t* point =
@@ -260,6 +260,11 @@ cv::Mat pixelView(const sensor_msgs::Image& message) {
   if (message.step < message.width * pixel_bytes) {
     throw DataError("image step " + std::to_string(message.step) + " is less than width * " +
                     std::to_string(pixel_bytes) + " bytes of '" + message.encoding + "'");
+  }
+  if (message.step % CV_ELEM_SIZE1(type) != 0) {
+    throw DataError("image step " + std::to_string(message.step) + " splits a number of '" +
+                    message.encoding + "'; a multiple of " + std::to_string(CV_ELEM_SIZE1(type)) +
+                    " is wanted");
   }
   const std::size_t wanted = static_cast<std::size_t>(message.step) * message.height;
   if (message.data.size() != wanted) {

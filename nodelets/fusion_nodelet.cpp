@@ -11,6 +11,7 @@
 
 #include "parameters.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -138,8 +139,8 @@ void FusionNodelet::startTicking() {
 
 StampNs FusionNodelet::now() const {
   if (!ros::Time::isSimTime()) return static_cast<StampNs>(ros::SteadyTime::now().toNSec());
-  const auto [clock_ns, stood_still_ns] = simulatedClock();
-  return clock_ns + std::max<StampNs>(0, stood_still_ns - kClockStall);
+  const auto [elapsed_ns, stood_still_ns] = simulatedClock();
+  return elapsed_ns + std::max<StampNs>(0, stood_still_ns - kClockStall);
 }
 
 std::pair<StampNs, StampNs> FusionNodelet::simulatedClock() const {
@@ -147,10 +148,13 @@ std::pair<StampNs, StampNs> FusionNodelet::simulatedClock() const {
   const auto clock_ns = static_cast<StampNs>(ros::Time::now().toNSec());
   std::lock_guard<std::mutex> lock(clock_mutex_);
   if (clock_ns != clock_ns_) {
+    // A jump is no time that passes: no deadline is due because of it.
+    const StampNs step_ns = clock_ns - clock_ns_;
+    if (step_ns > 0 && step_ns < EpochMonitor::kForwardNs) elapsed_ns_ += step_ns;
     clock_ns_ = clock_ns;
     clock_changed_ns_ = steady_ns;
   }
-  return {clock_ns, steady_ns - clock_changed_ns_};
+  return {elapsed_ns_, steady_ns - clock_changed_ns_};
 }
 
 void FusionNodelet::guard(const std::string& where, const std::function<void()>& work) {

@@ -82,9 +82,9 @@ class FusionNodelet : public nodelet::Nodelet {
   Health& health() { return health_; }
   std::mutex& connectMutex() { return connect_mutex_; }
 
-  /// The clock of deadlines: ROS time in simulation, else steady time. A simulated clock that
-  /// stands still goes on with wall time after 3 s, so that the last scans of a bag, which wait
-  /// for what it does not hold, come out.
+  /// The clock of deadlines, from an origin of its own: ROS time in simulation, else steady time.
+  /// Jumps of a simulated clock do not count. One that stands still goes on with wall time after
+  /// 3 s, so that the last scans of a bag, which wait for what it does not hold, come out.
   StampNs now() const;
 
   /// Runs `work`; no exception leaves. Errors are counted, reported (throttled) and shown.
@@ -163,7 +163,7 @@ class FusionNodelet : public nodelet::Nodelet {
   void onInit() final;
   bool mayReport(const std::string& key);
   void watch();
-  /// The simulated clock and how long it has stood still, both in ns.
+  /// How far the simulated clock has run, jumps apart, and how long it has stood still, both in ns.
   std::pair<StampNs, StampNs> simulatedClock() const;
   void reportOverflow(const std::string& topic);
   void keepQueues();
@@ -172,7 +172,7 @@ class FusionNodelet : public nodelet::Nodelet {
 
   /// Messages between roscpp and an Inbox, which takes them at once: never reached unless all
   /// threads of the manager are busy for long.
-  static constexpr uint32_t kTransportQueue = 256;
+  static constexpr uint32_t kTransportQueue = 64;
 
   /// A callback that runs while the nodelet is unloaded holds it until it returns, and the manager
   /// has destroyed the queues by then, into which timers and publishers reach as they end.
@@ -183,8 +183,9 @@ class FusionNodelet : public nodelet::Nodelet {
   std::mutex connect_mutex_;
   bool initialized_ = false;  ///< guarded by connect_mutex_
   mutable std::mutex clock_mutex_;
-  mutable StampNs clock_ns_ = 0;          ///< last simulated time, and
-  mutable StampNs clock_changed_ns_ = 0;  ///< when it came; both guarded by clock_mutex_
+  // The simulated clock, guarded by clock_mutex_: its last time, when that came, and how far it has
+  // gone without jumps.
+  mutable StampNs clock_ns_ = 0, clock_changed_ns_ = 0, elapsed_ns_ = 0;
   std::mutex report_mutex_;
   std::map<std::string, Health::Clock::time_point> reported_;
   Health::Clock::time_point started_ = Health::Clock::now();

@@ -333,6 +333,7 @@ CameraModel::CameraModel(const CameraInfo& info, const CameraModelOptions& optio
     cx_ = (info.k[2] - info.roi_x) / reduction.binning_x;
     cy_ = (info.k[5] - info.roi_y) / reduction.binning_y;
     if (distortion_ == DistortionModel::kEquidistant) skew_ = info.k[1] / info.k[0];
+    if (!std::isfinite(skew_)) refuse(info, "K[1]", info.k[1], "must be finite as K[1] / K[0]");
   }
 
   const double limit = max_theta_deg > 0.0 ? max_theta_deg * kPi / 180.0 : kPi;
@@ -397,9 +398,11 @@ std::optional<Eigen::Vector3d> CameraModel::ray(const Eigen::Vector2d& pixel) co
   if (!pixel.allFinite()) return std::nullopt;
   const double y = (pixel.y() - cy_) / fy_;
   const double x = (pixel.x() - cx_) / fx_ - skew_ * y;
+  // A focal length next to zero overflows: such pixels have no ray.
+  if (!std::isfinite(x) || !std::isfinite(y)) return std::nullopt;
   const auto raw = rawRay(x, y);
-  if (!raw) return std::nullopt;
-  return (R_raw_camera_.transpose() * *raw).normalized();
+  if (!raw || !raw->allFinite()) return std::nullopt;
+  return (R_raw_camera_.transpose() * *raw).stableNormalized();
 }
 
 std::optional<Eigen::Vector3d> CameraModel::rawRay(double x, double y) const {
@@ -436,7 +439,7 @@ std::optional<Eigen::Vector3d> CameraModel::rawRay(double x, double y) const {
     if (!(residual <= 1e-9 * (1.0 + radius))) return std::nullopt;
   }
   if (!(a.norm() <= max_radius_)) return std::nullopt;
-  return Eigen::Vector3d(a.x(), a.y(), 1.0).normalized();
+  return Eigen::Vector3d(a.x(), a.y(), 1.0).stableNormalized();
 }
 
 }  // namespace semantic_lidar_fusion

@@ -215,7 +215,7 @@ def connections_of(node, direction):
     return {entry[4] for entry in info if entry[2] == direction and (len(entry) < 6 or entry[5])}
 
 
-def wait_for_chain(rig_topics, publisher, timeout=30.0):
+def wait_for_chain(rig_topics, publisher, timeout=90.0):
     """Waits until `publisher` is connected to listeners of all these topics."""
     missing = lambda: set(rig_topics) - connections_of(publisher, "o")  # noqa: E731
     wait_until(lambda: not missing(), lambda: "listeners of %s" % sorted(missing()), timeout)

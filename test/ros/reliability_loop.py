@@ -32,9 +32,12 @@ class Loop(unittest.TestCase):
             diagnostics = live.Diagnostics()
             semantic = live.Received("/points_semantic", PointCloud2)
             with live.launched("fusion.launch", rig=made.rig, bond="false", manager="silent"):
-                self.said.wait_for(r"use_sim_time is true but /clock is silent; play with --clock")
+                self.said.wait_for(
+                    r"use_sim_time is true but /clock is silent; play with --clock", timeout=60.0
+                )
                 live.wait_until(
-                    lambda: diagnostics.levels.get("projection") == 3, "diagnostics that are stale"
+                    lambda: diagnostics.levels.get("projection") == 3,
+                    "diagnostics that are stale",
                 )
             semantic.close()
             diagnostics.close()
@@ -54,7 +57,7 @@ class Loop(unittest.TestCase):
                     live.wait_for_chain(made.topics(), "/player")
                     live.resume()
                     loops = live.wait_until(
-                        lambda: self.whole_loops(semantic.messages), "three loops", 60.0
+                        lambda: self.whole_loops(semantic.messages), "three loops", 90.0
                     )
             self.assertGreaterEqual(len(loops), LOOPS)
             first = min(expected)

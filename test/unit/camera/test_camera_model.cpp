@@ -595,6 +595,26 @@ TEST(CameraModel, ARejectedInfoNamesFieldValueAndRule) {
   }
 }
 
+TEST(CameraModel, RaysAreUnitVectorsOrAbsentForAnyFocalLength) {
+  for (const double focal : {1e-320, 1e-300, 1e-160, 1e-20, 1e20, 1e160, 1e300}) {
+    for (const char* model : {"equidistant", ""}) {
+      CameraInfo info = fisheyeInfo();
+      info.distortion_model = model;
+      if (*model == '\0') info.d.clear();
+      info.k[0] = info.k[4] = focal;
+      const CameraModel camera(info, CameraModelOptions());
+      for (const Eigen::Vector2d& pixel :
+           {Eigen::Vector2d(0, 0), Eigen::Vector2d(700, 300), Eigen::Vector2d(1e219, -1e219)}) {
+        const auto ray = camera.ray(pixel);
+        if (!ray) continue;
+        EXPECT_NEAR(ray->norm(), 1.0, 1e-9) << model << " " << focal;
+      }
+      const auto seen = camera.project({0.3, 0.2, 1.0});
+      EXPECT_TRUE(!seen || seen->allFinite()) << model << " " << focal;
+    }
+  }
+}
+
 TEST(CameraModel, RectifiedNeedsNoLensParameters) {
   CameraInfo info = fisheyeInfo();
   info.k.fill(0.0);

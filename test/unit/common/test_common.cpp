@@ -12,6 +12,7 @@ TEST(ConfigErrorTest, ListsEveryProblemOnALineOfItsOwn) {
   EXPECT_STREQ(error.what(), "a = 1: must be 2\nb: is missing");
   EXPECT_EQ(error.problems().size(), 2u);
   EXPECT_STRNE(ConfigError({}).what(), "");
+  EXPECT_STREQ(ConfigError({"a\nb: is \r missing"}).what(), "a?b: is ? missing");
 }
 
 TEST(ScanIntervalTest, IsTheEarliestAndLatestTimeInAnyOrder) {

@@ -125,6 +125,9 @@ void cameraInfoCases(std::vector<Case>* cases) {
   add(
       "K of zeros", kFisheye, false, [](Info& i) { i.K.fill(0); }, "K[0]");
   add(
+      "skew beyond all numbers", kFisheye, false, [](Info& i) { i.K[0] = 1e-300, i.K[1] = 1e20; },
+      "K[1]");
+  add(
       "fy of zero", kFisheye, false, [](Info& i) { i.K[4] = 0; }, "K[4]");
   add(
       "fx negative", kFisheye, false, [](Info& i) { i.K[0] = -300; }, "K[0]");
@@ -331,9 +334,11 @@ void imageCases(std::vector<Case>* cases) {
   broken(
       "step too small", [](Image& m) { m.step = 47; }, "step 47");
   broken(
+      "step that splits a number", [](Image& m) { m.step = 49, m.data.resize(49 * 3); }, "step 49");
+  broken(
       "step of zero", [](Image& m) { m.step = 0; }, "step 0");
   broken(
-      "step beyond the data", [](Image& m) { m.step = 0xFFFFFFFF; }, "bytes");
+      "step beyond the data", [](Image& m) { m.step = 0xFFFFFFFC; }, "bytes");
   broken(
       "width times pixel overflows", [](Image& m) { m.width = 0x20000000; }, "536870912x3");
   broken(
@@ -670,6 +675,9 @@ void cloudCases(std::vector<Case>* cases) {
       "beyond point_step");
   compensated(
       14, "other endianness", [](Message& m) { m.is_bigendian = true; }, "endianness");
+  compensated(
+      13, "rows without points", [](Message& m) { m.width = 0, m.height = 2, m.data.clear(); },
+      "0 points");
   compensated(
       13, "no points", [](Message& m) { m = *compensatedCloudMessage(Cloud()); }, "0 points");
 }
