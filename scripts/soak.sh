@@ -4,9 +4,10 @@
 # threads, file descriptors, losses and latency. Exit code 0 only if every limit holds.
 #
 #   scripts/soak.sh MINUTES [options]
-#     --bag FILE         the bag to loop (default: a simulated drive of 20 s)
+#     --bag FILE         the bag to loop (default: a simulated drive)
 #     --rig FILE         its rig file (default: config/demo.yaml, the simulated drive's)
 #     --scale S          image size of the simulated drive, 1 = 1920x1208 (default: 0.5)
+#     --duration S       its length in seconds (default: 10)
 #     --rate R           speed of playback (default: 1.0); 2 shows an overload, with --overload
 #     --overload         scans may be dropped, as long as each is counted
 #     --overrides TEXT   changes to the rig file, key=value separated by blanks
@@ -22,24 +23,25 @@ set -euo pipefail
 PATH=/usr/sbin:/usr/bin:/sbin:/bin
 source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
-usage() { sed -n '3,21s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
+usage() { sed -n '3,22s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
 fail() {
   echo "soak.sh: $*" >&2
   exit 2
 }
 
-minutes="" bag="" rig=$source_dir/config/demo.yaml scale=0.5 rate=1.0 warm_up=2
+minutes="" bag="" rig=$source_dir/config/demo.yaml scale=0.5 duration=10 rate=1.0 warm_up=2
 build_dir=$source_dir/build
 pass_on=()
 while [ $# -gt 0 ]; do
   case $1 in
-    --bag | --rig | --scale | --rate | --warm-up | --build-dir | --overrides | --growth-mb | \
-      --growth-percent | --drift-ms | --pairs-percent | --csv)
+    --bag | --rig | --scale | --duration | --rate | --warm-up | --build-dir | --overrides | \
+      --growth-mb | --growth-percent | --drift-ms | --pairs-percent | --csv)
       [ $# -ge 2 ] || fail "$1 needs a value"
       case $1 in
         --bag) bag=$2 ;;
         --rig) rig=$2 ;;
         --scale) scale=$2 ;;
+        --duration) duration=$2 ;;
         --rate) rate=$2 ;;
         --warm-up) warm_up=$2 ;;
         --build-dir) build_dir=$2 ;;
@@ -74,7 +76,7 @@ if [ -z "$bag" ]; then
   bag=$work/drive.bag
   simulator=$build_dir/devel/lib/semantic_lidar_fusion/simulate_drive
   [ -x "$simulator" ] || fail "simulate_drive is not built; give --bag and --rig"
-  "$simulator" --out "$bag" --duration 20 --scale "$scale" --seed 1 --quiet
+  "$simulator" --out "$bag" --duration "$duration" --scale "$scale" --seed 1 --quiet
 fi
 
 export ROS_IP=127.0.0.1 ROS_HOME=$work/ros_home ROSCONSOLE_STDOUT_LINE_BUFFERED=1

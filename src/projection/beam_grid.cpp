@@ -512,13 +512,16 @@ class Linker {
 BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config) {
   BeamGrid grid;
   if (config.mode == OcclusionMode::kOff) return grid;
+  const bool vertical_given = config.vertical_step_deg > 0.0;
+  const bool horizontal_given = config.horizontal_step_deg > 0.0;
   std::vector<std::uint16_t> rows;
-  const RangeImage image = rangeImage(cloud, config, &rows);
-  measureSteps(image, config, &grid);
-  if (config.vertical_step_deg > 0.0) grid.vertical_step_rad = radians(config.vertical_step_deg);
-  if (config.horizontal_step_deg > 0.0) {
-    grid.horizontal_step_rad = radians(config.horizontal_step_deg);
+  RangeImage image;
+  if (config.mode == OcclusionMode::kAdaptive || !vertical_given || !horizontal_given) {
+    image = rangeImage(cloud, config, &rows);
+    measureSteps(image, config, &grid);
   }
+  if (vertical_given) grid.vertical_step_rad = radians(config.vertical_step_deg);
+  if (horizontal_given) grid.horizontal_step_rad = radians(config.horizontal_step_deg);
   if (config.mode != OcclusionMode::kAdaptive) return grid;
 
   Linker linker(image, config, grid);
