@@ -49,7 +49,7 @@ PAIRS = [
         None,
         None,
     ),
-    ("motion", r"motion.*/ours.*", r"motion.*/(pcl|peer).*", "pcl_ros + tf2 per packet", 8, 11),
+    ("motion", r"motion.*/ours.*", r"motion.*/(pcl|peer|tf2).*", "pcl_ros + tf2 per packet", 8, 11),
     (
         "projection",
         r"projection/ours.*",
