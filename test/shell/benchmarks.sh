@@ -6,7 +6,7 @@ shopt -s nullglob
 sources=("$SLF_SOURCE_DIR"/test/benchmark/benchmark_*.cpp)
 [ ${#sources[@]} -gt 0 ] || { echo "no benchmark_*.cpp"; exit 1; }
 grep -q '^benchmark_DIR:PATH=/' "$SLF_BUILD_DIR/CMakeCache.txt" || {
-  echo "Google Benchmark is not installed, or SLF_BUILD_BENCHMARKS is OFF"
+  echo "Google Benchmark 1.5.3 or later is not installed, or SLF_BUILD_BENCHMARKS is OFF"
   exit 77
 }
 for source in "${sources[@]}"; do
