@@ -2,12 +2,14 @@
 #include "box_reduction.h"
 
 #include <algorithm>
+#include <cstddef>
 #include <numeric>
 
 namespace semantic_lidar_fusion {
 namespace {
 
 constexpr std::int64_t kSmallArea = 1 << 16;
+constexpr int kMaxRowsAhead = 4;  ///< as many rows of a camera's image as a first-level cache holds
 
 }  // namespace
 
@@ -33,9 +35,32 @@ BoxReduction::BoxReduction(const ImageSize& source, const ImageSize& target, int
       x_(source.width, target.width),
       y_(source.height, target.height) {
   for (int x = 0; x < target.width; ++x) columns_.push_back(x_.span(x));
-  // One entry more than there are, as averageColumns wants it.
+  // Some entries more than there are, as the kernels want it.
   row_sums_.resize(static_cast<std::size_t>(source.width) * channels + 1);
-  result_.resize(static_cast<std::size_t>(target.width) * channels + 1);
+  result_.resize(static_cast<std::size_t>(target.width) * channels + 4);
+  fillTaps();
+}
+
+void BoxReduction::fillTaps() {
+  const auto narrow = [](const BoxSpan& span) { return span.count <= kBoxTaps; };
+  if (channels_ != 3 || x_.source_units > kMaxBoxTap ||
+      x_.target_units * y_.target_units > kMaxNarrowArea ||
+      !std::all_of(columns_.begin(), columns_.end(), narrow)) {
+    return;
+  }
+  taps_.assign(columns_.size() * kBoxTapBytes, 0);
+  std::uint8_t* taps = taps_.data();
+  for (const BoxSpan& span : columns_) {
+    for (int c = 0; c < channels_; ++c) {
+      std::uint8_t* const of_channel = taps + static_cast<std::ptrdiff_t>(c) * kBoxTaps;
+      std::fill_n(of_channel, span.count, static_cast<std::uint8_t>(x_.source_units));
+      of_channel[0] = static_cast<std::uint8_t>(span.first_weight);
+      if (span.count > 1) {
+        of_channel[span.count - 1] = static_cast<std::uint8_t>(span.last_weight);
+      }
+    }
+    taps += kBoxTapBytes;
+  }
 }
 
 /// For any number of channels and any area.
@@ -65,10 +90,23 @@ const std::uint8_t* BoxReduction::row(const cv::Mat& image, int y, const SlicKer
   row_weights_.assign(span.count, static_cast<std::uint32_t>(y_.source_units));
   row_weights_.front() = span.first_weight;
   if (span.count > 1) row_weights_.back() = span.last_weight;
+  const std::int64_t area = x_.target_units * y_.target_units;
+  if (!taps_.empty() && kernels.averageNarrowBoxes != nullptr) {
+    int ahead = 0;
+    if (y + 1 < target_.height) {
+      const BoxSpan next = y_.span(y + 1);
+      ahead = next.first + next.count - (span.first + span.count);
+      ahead = std::min(ahead, kMaxRowsAhead);
+    }
+    for (int i = 0; i < ahead; ++i) rows_.push_back(image.ptr(span.first + span.count + i));
+    kernels.averageNarrowBoxes(
+        rows_.data(), row_weights_.data(), span.count, ahead,
+        {columns_.data(), taps_.data(), target_.width, source_.width, static_cast<int>(area)},
+        result_.data());
+    return result_.data();
+  }
   kernels.sumRows(rows_.data(), row_weights_.data(), span.count, source_.width * channels_,
                   row_sums_.data());
-
-  const std::int64_t area = x_.target_units * y_.target_units;
   if (channels_ == 3 && area < kSmallArea) {
     kernels.averageColumns(row_sums_.data(),
                            {columns_.data(), target_.width,

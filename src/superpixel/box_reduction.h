@@ -33,12 +33,14 @@ class BoxReduction {
     BoxSpan span(int target_index) const;
     std::int64_t target_units = 1, source_units = 1;
   };
+  void fillTaps();
   void averageAnyColumns();
 
   ImageSize source_, target_;
   int channels_ = 0;
   Axis x_, y_;
-  std::vector<BoxSpan> columns_;  ///< of each target column
+  std::vector<BoxSpan> columns_;    ///< of each target column
+  std::vector<std::uint8_t> taps_;  ///< as in NarrowBoxes; empty if some box does not fit there
   std::vector<const std::uint8_t*> rows_;
   std::vector<std::uint32_t> row_weights_, row_sums_;
   std::vector<std::uint8_t> result_;

@@ -122,8 +122,8 @@ void runStarts(const std::uint8_t* index, int block_count, std::uint32_t* starts
 
 }  // namespace
 
-const SlicKernels kPlainSlicKernels = {"plain", assign,  accumulate,     opponentColours,
-                                       smooth,  sumRows, averageColumns, runStarts};
+const SlicKernels kPlainSlicKernels = {"plain", assign,         accumulate, opponentColours, smooth,
+                                       sumRows, averageColumns, nullptr,    runStarts};
 
 SlicKernelList usableSlicKernels() {
   SlicKernelList list{1, {&kPlainSlicKernels, nullptr, nullptr}};

@@ -56,6 +56,23 @@ struct BoxColumns {
   int area;  ///< sum of the weights of a box, below 2^16
 };
 
+constexpr int kBoxTaps = 4;
+/// Bytes of `taps` for each target pixel: the weights of a box's source columns, 0 beyond the last,
+/// once for each channel, and as many zeros.
+constexpr int kBoxTapBytes = 4 * kBoxTaps;
+
+/// Boxes of one row, for images of three channels whose boxes are at most kBoxTaps source pixels
+/// wide.
+struct NarrowBoxes {
+  const BoxSpan* spans;      ///< of each target pixel
+  const std::uint8_t* taps;  ///< kBoxTapBytes of each target pixel, at most kMaxBoxTap
+  int count;
+  int source_width;
+  int area;  ///< sum of the weights of a box, at most kMaxNarrowArea
+};
+constexpr int kMaxBoxTap = 64;
+constexpr int kMaxNarrowArea = 1 << 13;
+
 struct SlicKernels {
   const char* name;
 
@@ -84,6 +101,14 @@ struct SlicKernels {
   /// out[3 i + c] = mean over box i of the row sums of channel c, rounded to nearest. One entry
   /// beyond the end of `sums` is readable and one of `out` writable.
   void (*averageColumns)(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out);
+
+  /// Both of the above in one pass: out[3 i + c] = mean over box i of channel c, rounded to
+  /// nearest, of `row_count` rows with these weights. `ahead_count` more rows, which the next call
+  /// wants, are brought near. Four entries beyond the end of `out` are writable. Null where two
+  /// passes are faster.
+  void (*averageNarrowBoxes)(const std::uint8_t* const* rows, const std::uint32_t* weights,
+                             int row_count, int ahead_count, const NarrowBoxes& boxes,
+                             std::uint8_t* out);
 
   /// For each block of a row, bit x tells that index[x] differs from index[x - 1]; bit 0 is 0,
   /// since indices of different blocks do not compare.

@@ -224,6 +224,12 @@ void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::u
   kAvx2SlicKernels.averageColumns(sums, columns, out);
 }
 
+void averageNarrowBoxes(const std::uint8_t* const* rows, const std::uint32_t* weights,
+                        int row_count, int ahead_count, const NarrowBoxes& boxes,
+                        std::uint8_t* out) {
+  kAvx2SlicKernels.averageNarrowBoxes(rows, weights, row_count, ahead_count, boxes, out);
+}
+
 void runStarts(const std::uint8_t* index, int block_count, std::uint32_t* starts) {
   kAvx2SlicKernels.runStarts(index, block_count, starts);
 }
@@ -231,6 +237,7 @@ void runStarts(const std::uint8_t* index, int block_count, std::uint32_t* starts
 }  // namespace
 
 const SlicKernels kAvx512SlicKernels = {"avx512", assign,  accumulate,     opponentColours,
-                                        smooth,   sumRows, averageColumns, runStarts};
+                                        smooth,   sumRows, averageColumns, averageNarrowBoxes,
+                                        runStarts};
 
 }  // namespace semantic_lidar_fusion

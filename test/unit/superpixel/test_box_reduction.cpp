@@ -91,5 +91,83 @@ TEST(BoxReduction, MeansOfTwoLevelsRoundExactly) {
   }
 }
 
+// The same for boxes that are narrow and high, up to the limit of their fast division.
+TEST(BoxReduction, MeansOfTwoLevelsRoundExactlyInNarrowBoxes) {
+  constexpr int kTargetWidth = 24;
+  for (const int box_width : {1, 2, 3, 4}) {
+    for (const int area : {255, 4096, 8191, 8192, 8193}) {
+      const int height = std::max(1, area / box_width), pixels = box_width * height;
+      cv::Mat image(height, box_width * kTargetWidth, CV_8UC3);
+      BoxReduction reduction({image.cols, image.rows}, {kTargetWidth, 1}, 3);
+      for (const SlicKernels* kernels : usableKernels()) {
+        for (const int level : {0, 127, 254}) {
+          image.setTo(cv::Scalar::all(level));
+          // Target pixel x has the more pixels of the higher level, around half of them.
+          std::vector<int> bright_counts;
+          for (int x = 0; x < kTargetWidth; ++x) {
+            const int bright = std::min(std::max(0, pixels / 2 - kTargetWidth / 2 + x), pixels);
+            bright_counts.push_back(bright);
+            for (int i = 0; i < bright; ++i) {
+              const int column = x * box_width + i % box_width;
+              image.at<cv::Vec3b>(i / box_width, column) = cv::Vec3b::all(level + 1);
+            }
+          }
+          const std::uint8_t* row = reduction.row(image, 0, *kernels);
+          for (int i = 0; i < 3 * kTargetWidth; ++i) {
+            const int bright = bright_counts[i / 3];
+            ASSERT_EQ(row[i], 2 * bright >= pixels ? level + 1 : level)
+                << kernels->name << ": " << bright << " of " << pixels;
+          }
+        }
+      }
+    }
+  }
+}
+
+/// A copy of an image at an odd address or not, whose last row ends where its memory does, with
+/// bytes of another colour between the rows.
+struct PaddedImage {
+  PaddedImage(const cv::Mat& image, int shift, int padding)
+      : stride(image.cols * image.elemSize() + padding),
+        bytes(shift + stride * (image.rows - 1) + image.cols * image.elemSize(), 255),
+        view(image.rows, image.cols, image.type(), bytes.data() + shift, stride) {
+    image.copyTo(view);
+  }
+  std::size_t stride;
+  std::vector<std::uint8_t> bytes;
+  cv::Mat view;
+};
+
+TEST(BoxReduction, WideKernelsGiveThePlainBytes) {
+  const auto compare = [](const ImageSize& source, const ImageSize& target) {
+    SCOPED_TRACE(std::to_string(source.width) + "x" + std::to_string(source.height) + " to " +
+                 std::to_string(target.width) + "x" + std::to_string(target.height));
+    const cv::Mat image = noiseImage(source.width, source.height, CV_8UC3, 21);
+    BoxReduction plain(source, target, 3);
+    for (const SlicKernels* kernels : usableKernels()) {
+      BoxReduction wide(source, target, 3);
+      for (const int padding : {0, 1, 7}) {
+        const PaddedImage padded(image, padding % 5, padding);
+        for (int y = 0; y < target.height; ++y) {
+          const std::uint8_t* expected = plain.row(image, y, kPlainSlicKernels);
+          const std::uint8_t* row = wide.row(padded.view, y, *kernels);
+          ASSERT_TRUE(std::equal(row, row + 3 * target.width, expected))
+              << kernels->name << ", row " << y << ", padding " << padding;
+        }
+      }
+    }
+  };
+  // A camera's size to that of the map: boxes of whole columns and parts of rows.
+  compare({1920, 31}, {640, 10});
+  compare({480, 302}, {160, 101});
+  // Every width of a box from 1 to 6 columns, in whole and broken ratios, odd widths, single rows.
+  for (int width = 1; width <= 70; ++width) {
+    for (const int target_width : {1, 3, 16, 23, 32, 64}) compare({width, 1}, {target_width, 1});
+    for (const int ratio : {2, 3, 4, 5}) compare({width * ratio, 7}, {width, 2});
+  }
+  compare({127, 63}, {64, 32});
+  compare({195, 9}, {65, 4});
+}
+
 }  // namespace
 }  // namespace semantic_lidar_fusion
