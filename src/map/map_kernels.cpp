@@ -34,9 +34,9 @@ void logEvidencePlain(const float* probabilities, std::size_t count,
   }
 }
 
-void countEvidence(const float* probabilities, std::size_t count,
-                   const EvidenceConstants& constants, const std::int32_t* /*prior*/,
-                   std::int32_t* evidence) {
+void countEvidencePlain(const float* probabilities, std::size_t count,
+                        const EvidenceConstants& constants, const std::int32_t* /*prior*/,
+                        std::int32_t* evidence) {
   for (std::size_t i = 0; i < count; ++i) {
     float p = probabilities[i] > 0.0f ? probabilities[i] : 0.0f;
     p = p < 1.0f ? p : 1.0f;
@@ -83,6 +83,13 @@ EvidenceKernel logEvidence() {
   if (__builtin_cpu_supports("avx2")) return logEvidenceAvx2;
 #endif
   return logEvidencePlain;
+}
+
+EvidenceKernel countEvidence() {
+#ifdef SLF_HAVE_AVX2
+  if (__builtin_cpu_supports("avx2")) return countEvidenceAvx2;
+#endif
+  return countEvidencePlain;
 }
 
 AddEvidence addEvidence() {

@@ -40,6 +40,20 @@ void logEvidenceAvx2(const float* probabilities, std::size_t count,
   logEvidencePlain(probabilities + i, count - i, constants, prior + i, evidence + i);
 }
 
+void countEvidenceAvx2(const float* probabilities, std::size_t count,
+                       const EvidenceConstants& constants, const std::int32_t* prior,
+                       std::int32_t* evidence) {
+  const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f);
+  const __m256 scale = _mm256_set1_ps(constants.scale), half = _mm256_set1_ps(0.5f);
+  std::size_t i = 0;
+  for (; i + 8 <= count; i += 8) {
+    const __m256 p = _mm256_min_ps(_mm256_max_ps(_mm256_loadu_ps(probabilities + i), zero), one);
+    const __m256i rounded = _mm256_cvttps_epi32(_mm256_add_ps(_mm256_mul_ps(p, scale), half));
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(evidence + i), rounded);
+  }
+  countEvidencePlain(probabilities + i, count - i, constants, prior, evidence + i);
+}
+
 void addEvidenceAvx2(const std::int32_t* evidence, int class_count, std::int64_t* sums) {
   int c = 0;
   for (; c + 4 <= class_count; c += 4) {
