@@ -49,7 +49,7 @@ EvidenceModel::EvidenceModel(const EvidenceConfig& config) : kind_(config.kind) 
   floor_ = static_cast<float>(config.floor);
   if (kind_ == EvidenceKind::kDirichlet) {
     scale_ = static_cast<float>(std::ldexp(config.weight, kEvidenceBits));
-    kernel_ = countEvidence;
+    kernel_ = countEvidence();
     prior_.assign(static_cast<std::size_t>(kMaxRows) * class_count_, 0);
     return;
   }

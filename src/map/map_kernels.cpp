@@ -34,9 +34,9 @@ void logEvidencePlain(const float* probabilities, std::size_t count,
   }
 }
 
-void countEvidence(const float* probabilities, std::size_t count,
-                   const EvidenceConstants& constants, const std::int32_t* /*prior*/,
-                   std::int32_t* evidence) {
+void countEvidencePlain(const float* probabilities, std::size_t count,
+                        const EvidenceConstants& constants, const std::int32_t* /*prior*/,
+                        std::int32_t* evidence) {
   for (std::size_t i = 0; i < count; ++i) {
     float p = probabilities[i] > 0.0f ? probabilities[i] : 0.0f;
     p = p < 1.0f ? p : 1.0f;
@@ -49,7 +49,33 @@ void addEvidencePlain(const std::int32_t* evidence, int class_count, std::int64_
 }
 
 void placePointsPlain(const PlacementConstants& constants, PlacedPoints* points) {
-  placeAll(constants, points);
+  constexpr int kCount = PlacedPoints::kMaxPoints;
+  const double size = constants.voxel_size_m;
+  double inside[kCount];
+  for (int i = 0; i < kCount; ++i) inside[i] = 1.0;
+  for (int axis = 0; axis < 3; ++axis) {
+    const double a = constants.rows[axis][0], b = constants.rows[axis][1];
+    const double c = constants.rows[axis][2], d = constants.rows[axis][3];
+    std::int32_t* const index = points->index[axis];
+    std::int32_t* const offset = points->offset[axis];
+    for (int i = 0; i < kCount; ++i) {
+      const double at = a * static_cast<double>(points->x[i]) +
+                        b * static_cast<double>(points->y[i]) +
+                        c * static_cast<double>(points->z[i]) + d;
+      double cell = at / size;
+      const bool far = !(cell < kMaxIndex) | !(cell > -kMaxIndex);
+      inside[i] = far ? 0.0 : inside[i];
+      cell = far ? 0.0 : cell;
+      double whole = static_cast<double>(static_cast<std::int32_t>(cell));
+      whole -= cell < whole ? 1.0 : 0.0;
+      index[i] = static_cast<std::int32_t>(whole);
+      // Not negative by more than a rounding error, so that the cast rounds down.
+      double within = (at - whole * size) * kPositionUnit + 0.5;
+      within = far ? 0.0 : within;
+      offset[i] = static_cast<std::int32_t>(within);
+    }
+  }
+  for (int i = 0; i < kCount; ++i) points->inside[i] = inside[i] > 0.0 ? 1 : 0;
 }
 
 EvidenceKernel logEvidence() {
@@ -57,6 +83,13 @@ EvidenceKernel logEvidence() {
   if (__builtin_cpu_supports("avx2")) return logEvidenceAvx2;
 #endif
   return logEvidencePlain;
+}
+
+EvidenceKernel countEvidence() {
+#ifdef SLF_HAVE_AVX2
+  if (__builtin_cpu_supports("avx2")) return countEvidenceAvx2;
+#endif
+  return countEvidencePlain;
 }
 
 AddEvidence addEvidence() {

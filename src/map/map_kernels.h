@@ -30,9 +30,12 @@ void logEvidenceAvx2(const float* probabilities, std::size_t count,
                      const EvidenceConstants& constants, const std::int32_t* prior,
                      std::int32_t* evidence);
 /// evidence[i] = round(scale * P).
-void countEvidence(const float* probabilities, std::size_t count,
-                   const EvidenceConstants& constants, const std::int32_t* prior,
-                   std::int32_t* evidence);
+void countEvidencePlain(const float* probabilities, std::size_t count,
+                        const EvidenceConstants& constants, const std::int32_t* prior,
+                        std::int32_t* evidence);
+void countEvidenceAvx2(const float* probabilities, std::size_t count,
+                       const EvidenceConstants& constants, const std::int32_t* prior,
+                       std::int32_t* evidence);
 
 /// sums[c] += evidence[c]
 using AddEvidence = void (*)(const std::int32_t* evidence, int class_count, std::int64_t* sums);
@@ -60,6 +63,7 @@ void placePointsAvx2(const PlacementConstants& constants, PlacedPoints* points);
 
 /// The fastest that the machine has.
 EvidenceKernel logEvidence();
+EvidenceKernel countEvidence();
 AddEvidence addEvidence();
 PlacePoints placePoints();
 

@@ -20,37 +20,5 @@ constexpr int kSignificand = 0x007fffff;
 constexpr double kMaxIndex = 536870912.0;
 constexpr double kPositionUnit = 1048576.0;
 
-/// Written so that compilers make it wide.
-inline __attribute__((always_inline)) void placeAll(const PlacementConstants& constants,
-                                                    PlacedPoints* points) {
-  constexpr int kCount = PlacedPoints::kMaxPoints;
-  const double size = constants.voxel_size_m;
-  double inside[kCount];
-  for (int i = 0; i < kCount; ++i) inside[i] = 1.0;
-  for (int axis = 0; axis < 3; ++axis) {
-    const double a = constants.rows[axis][0], b = constants.rows[axis][1];
-    const double c = constants.rows[axis][2], d = constants.rows[axis][3];
-    std::int32_t* const index = points->index[axis];
-    std::int32_t* const offset = points->offset[axis];
-    for (int i = 0; i < kCount; ++i) {
-      const double at = a * static_cast<double>(points->x[i]) +
-                        b * static_cast<double>(points->y[i]) +
-                        c * static_cast<double>(points->z[i]) + d;
-      double cell = at / size;
-      const bool far = !(cell < kMaxIndex) | !(cell > -kMaxIndex);
-      inside[i] = far ? 0.0 : inside[i];
-      cell = far ? 0.0 : cell;
-      double whole = static_cast<double>(static_cast<std::int32_t>(cell));
-      whole -= cell < whole ? 1.0 : 0.0;
-      index[i] = static_cast<std::int32_t>(whole);
-      // Not negative by more than a rounding error, so that the cast rounds down.
-      double within = (at - whole * size) * kPositionUnit + 0.5;
-      within = far ? 0.0 : within;
-      offset[i] = static_cast<std::int32_t>(within);
-    }
-  }
-  for (int i = 0; i < kCount; ++i) points->inside[i] = inside[i] > 0.0 ? 1 : 0;
-}
-
 }  // namespace
 }  // namespace semantic_lidar_fusion

@@ -19,6 +19,7 @@ constexpr int kFirstSlotBits = 12;
 constexpr std::size_t kMaxLoad[2] = {3, 4};  // 3/4 of the slots
 constexpr double kIntensityUnit = 1048576.0;
 constexpr float kMaxIntensity = 1e6f;
+constexpr std::size_t kPointsAhead = 24;  // to fetch into the cache
 
 template <typename Value>
 Value valueAt(const Column& column, std::size_t row) {
@@ -120,19 +121,26 @@ void VoxelMap::clear() {
   slots_.assign(std::size_t{1} << kFirstSlotBits, Slot{});
   slots_.shrink_to_fit();
   chunks_.clear();
+  blocks_.clear();
 }
 
 std::size_t VoxelMap::memoryBytes() const {
-  return slots_.capacity() * sizeof(Slot) + chunks_.size() * kChunkSize * recordSize();
+  std::size_t bytes = slots_.capacity() * sizeof(Slot);
+  for (std::size_t chunk = 0; chunk < chunks_.size();) {
+    const std::size_t count = chunksOfBlock(chunk);
+    bytes += bytesOfBlock(count);
+    chunk += count;
+  }
+  return bytes;
 }
 
-std::uint64_t VoxelMap::hashOf(std::uint64_t xy, std::uint32_t z_layer) {
+inline std::uint64_t VoxelMap::hashOf(std::uint64_t xy, std::uint32_t z_layer) {
   std::uint64_t hash = (xy ^ (xy >> 29)) * 0x9e3779b97f4a7c15ULL;
   hash = (hash ^ (hash >> 32) ^ z_layer) * 0xbf58476d1ce4e5b9ULL;
   return hash ^ (hash << 21);
 }
 
-void VoxelMap::place(const Slot& slot) {
+inline void VoxelMap::place(const Slot& slot) {
   const std::size_t mask = slots_.size() - 1;
   std::size_t at = hashOf(slot.xy, slot.z_layer) >> shift_;
   while (slots_[at].index != 0) at = (at + 1) & mask;
@@ -140,7 +148,7 @@ void VoxelMap::place(const Slot& slot) {
 }
 
 void VoxelMap::grow() {
-  std::vector<Slot> old(slots_.size() * 2);
+  decltype(slots_) old(slots_.size() * 2);
   old.swap(slots_);
   --shift_;
   for (const Slot& slot : old) {
@@ -148,7 +156,25 @@ void VoxelMap::grow() {
   }
 }
 
-std::int64_t* VoxelMap::findOrMake(std::uint64_t xy, std::uint32_t z_layer, std::uint64_t hash) {
+std::size_t VoxelMap::chunksOfBlock(std::size_t first_chunk) const {
+  const std::size_t fit = kHugePage / (kChunkSize * recordSize());
+  return first_chunk < fit ? 1 : std::max<std::size_t>(fit, 1);
+}
+
+std::size_t VoxelMap::bytesOfBlock(std::size_t chunks) const {
+  const std::size_t bytes = chunks * kChunkSize * recordSize();
+  return chunks == 1 ? bytes : std::max(bytes, kHugePage);
+}
+
+void VoxelMap::addBlock() {
+  const std::size_t count = chunksOfBlock(chunks_.size());
+  const std::size_t words = kChunkSize * words_;
+  blocks_.emplace_back(static_cast<std::int64_t*>(allocateHuge(bytesOfBlock(count))));
+  for (std::size_t i = 0; i < count; ++i) chunks_.push_back(blocks_.back().get() + i * words);
+}
+
+inline std::int64_t* VoxelMap::findOrMake(std::uint64_t xy, std::uint32_t z_layer,
+                                          std::uint64_t hash) {
   const std::size_t mask = slots_.size() - 1;
   std::size_t at = hash >> shift_;
   for (; slots_[at].index != 0; at = (at + 1) & mask) {
@@ -157,8 +183,7 @@ std::int64_t* VoxelMap::findOrMake(std::uint64_t xy, std::uint32_t z_layer, std:
   }
   if (size_ >= std::numeric_limits<std::uint32_t>::max() - 1)
     throw DataError("voxel map: more than 2^32 voxels; use larger ones, or more tiles");
-  if (size_ == chunks_.size() * kChunkSize)
-    chunks_.emplace_back(new std::int64_t[kChunkSize * words_]);
+  if (size_ == chunks_.size() * kChunkSize) addBlock();
   std::int64_t* const made = record(size_);
   std::memset(made, 0, recordSize());
   VoxelHeader* const voxel = header(made);
@@ -187,6 +212,11 @@ IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transf
   const std::size_t classes = config_.dynamic.size();
   Batch batch;
   for (std::size_t i = 0; i < points.count; ++i) {
+    // A point takes one or two cache lines of its message.
+    const std::size_t ahead = std::min(i + kPointsAhead, points.count - 1);
+    __builtin_prefetch(points.x.data + static_cast<std::ptrdiff_t>(ahead) * points.x.stride);
+    __builtin_prefetch(points.status.data +
+                       static_cast<std::ptrdiff_t>(ahead) * points.status.stride);
     const std::uint8_t status = valueAt<std::uint8_t>(points.status, i);
     if (status > static_cast<std::uint8_t>(PointStatus::kNoImage)) {
       ++counts.no_odometry;
@@ -252,6 +282,7 @@ void VoxelMap::integrateBatch(const PlacementConstants& pose, StampNs stamp, Bat
     records[i] = findOrMake(xy[i], z_layer[i], hashes[i]);
     const char* const lines = reinterpret_cast<const char*>(records[i]);
     for (std::size_t byte = 0; byte < recordSize(); byte += 64) __builtin_prefetch(lines + byte, 1);
+    __builtin_prefetch(lines + recordSize() - 1, 1);
     has_evidence[i] = false;
     if (!batch->probabilities[i]) continue;
     has_evidence[i] =
@@ -343,7 +374,10 @@ void VoxelMap::keepInside(const std::array<std::int32_t, 3>& min,
     ++kept;
   }
   size_ = kept;
-  chunks_.resize((kept + kChunkSize - 1) / kChunkSize);
+  std::size_t chunks = 0, blocks = 0;
+  for (; chunks * kChunkSize < kept; ++blocks) chunks += chunksOfBlock(chunks);
+  chunks_.resize(chunks);
+  blocks_.resize(blocks);
   int bits = kFirstSlotBits;
   while (kept * kMaxLoad[1] > (std::size_t{1} << bits) * kMaxLoad[0]) ++bits;
   shift_ = 64 - bits;

@@ -16,11 +16,13 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <cstdlib>
 #include <memory>
 #include <vector>
 
 #include "semantic_lidar_fusion/common/types.h"
 #include "semantic_lidar_fusion/map/evidence.h"
+#include "semantic_lidar_fusion/map/huge_pages.h"
 
 namespace semantic_lidar_fusion {
 
@@ -117,12 +119,15 @@ class VoxelMap {
   struct Batch;
 
   std::int64_t* record(std::size_t index) const {
-    return chunks_[index >> kChunkBits].get() + (index & (kChunkSize - 1)) * words_;
+    return chunks_[index >> kChunkBits] + (index & (kChunkSize - 1)) * words_;
   }
   static std::uint64_t hashOf(std::uint64_t xy, std::uint32_t z_layer);
   void place(const Slot& slot);
   std::int64_t* findOrMake(std::uint64_t xy, std::uint32_t z_layer, std::uint64_t hash);
   void grow();
+  void addBlock();
+  std::size_t chunksOfBlock(std::size_t first_chunk) const;
+  std::size_t bytesOfBlock(std::size_t chunks) const;
   void integrateBatch(const PlacementConstants& pose, StampNs stamp, Batch* batch,
                       IntegrationCounts* counts);
 
@@ -136,10 +141,16 @@ class VoxelMap {
   std::size_t words_ = 0;  ///< of a record
   std::size_t size_ = 0;
   int shift_ = 0;  ///< 64 - log2 of the number of slots
-  std::vector<Slot> slots_;
-  std::vector<std::unique_ptr<std::int64_t[]>> chunks_;  ///< records never move
-  std::vector<float> rows_;                              ///< distributions of a batch
-  std::vector<std::int32_t> row_evidence_;               ///< their evidence
+  std::vector<Slot, HugePageAllocator<Slot>> slots_;
+  struct Free {
+    void operator()(void* memory) const { std::free(memory); }
+  };
+  /// Own the chunks: one each for the first ones, so that small maps stay small, then as many as
+  /// fit a huge page.
+  std::vector<std::unique_ptr<std::int64_t, Free>> blocks_;
+  std::vector<std::int64_t*> chunks_;       ///< of kChunkSize records, which never move
+  std::vector<float> rows_;                 ///< distributions of a batch
+  std::vector<std::int32_t> row_evidence_;  ///< their evidence
 };
 
 }  // namespace semantic_lidar_fusion

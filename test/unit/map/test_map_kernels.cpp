@@ -102,6 +102,11 @@ TEST(MapKernels, WideOnesGiveTheSameIntegers) {
     logEvidencePlain(p.data(), p.size(), constants, prior.data(), plain.data());
     logEvidenceAvx2(p.data(), p.size(), constants, prior.data(), wide.data());
     EXPECT_EQ(plain, wide);
+    std::vector<std::int32_t> counts(p.size()), wide_counts(p.size());
+    constants.scale = static_cast<float>(std::ldexp(weight, kEvidenceBits));
+    countEvidencePlain(p.data(), p.size(), constants, nullptr, counts.data());
+    countEvidenceAvx2(p.data(), p.size(), constants, nullptr, wide_counts.data());
+    EXPECT_EQ(counts, wide_counts);
   }
   std::vector<std::int64_t> sums(p.size(), std::int64_t{1} << 40), wide_sums = sums;
   addEvidencePlain(plain.data(), static_cast<int>(plain.size()), sums.data());

@@ -132,6 +132,27 @@ TEST(VoxelMap, ForgetsWhatIsOutside) {
   EXPECT_EQ(map.size(), before);
 }
 
+TEST(VoxelMap, StaysWholeWhenItsMemoryShrinksAndGrows) {
+  // Enough voxels for several huge pages of records and a table of more than one.
+  VoxelMap map(config()), part(config());
+  const std::vector<Point> points = cloud(5, 150000);
+  map.integrate(view(points), pose(0.0), 0);
+  ASSERT_GT(map.size() * map.recordSize(), 3 * kHugePage);
+  EXPECT_GE(map.memoryBytes(), map.size() * map.recordSize());
+  const std::vector<std::uint8_t> all = map.records();
+  const int x = static_cast<int>(331000 / 0.25), far = 1 << 30;
+  for (const int half_width : {1000, 20, 2, 0}) {
+    map.keepInside({x - half_width, -far, -far}, {x + half_width, far, far});
+    part.add(all.data(), all.size());
+    part.keepInside({x - half_width, -far, -far}, {x + half_width, far, far});
+    EXPECT_EQ(map.records(), part.records());
+    part.clear();
+  }
+  map.clear();
+  map.integrate(view(points), pose(0.0), 0);
+  EXPECT_EQ(map.records(), all);
+}
+
 TEST(VoxelMap, RefusesBrokenRecordsAndConfigurations) {
   VoxelMap map(config());
   const std::vector<std::uint8_t> bytes(map.recordSize() + 1);
