@@ -99,7 +99,7 @@ def make_parser():
     )  # fmt: skip
     work = parser.add_argument_group("the work")
     work.add_argument(
-        "--workers", metavar="N", type=_positive, default=1, help="processes here (default: 1)"
+        "--workers", metavar="N", type=cli.positive, default=1, help="processes here (default: 1)"
     )
     work.add_argument(
         "--scheduler", metavar="ADDRESS", help="an existing Dask cluster, whose workers reach the "
@@ -108,7 +108,7 @@ def make_parser():
     work.add_argument(
         "--memory",
         metavar="MB",
-        type=_positive,
+        type=cli.positive,
         default=1024,
         help="of voxels to hold before they go to disk (default: 1024)",
     )
@@ -139,13 +139,6 @@ def _prior(text):
         if not equals:
             raise argparse.ArgumentTypeError("%s: must be NAME=P" % entry)
     return result
-
-
-def _positive(text):
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("must be positive")
-    return value
 
 
 def check(parser, options):

@@ -97,7 +97,7 @@ def make_parser():
     parser.add_argument(
         "--pixel-step",
         metavar="N",
-        type=_positive,
+        type=cli.positive,
         default=2,
         help="score every N-th pixel in both directions (default: 2)",
     )
@@ -132,13 +132,6 @@ def _not_negative(text):
     value = float(text)
     if not value >= 0:
         raise argparse.ArgumentTypeError("must not be negative")
-    return value
-
-
-def _positive(text):
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("must be positive")
     return value
 
 

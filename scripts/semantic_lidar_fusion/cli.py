@@ -5,6 +5,7 @@ A command is its parser, one library call and its output. It imports numpy, ROS 
 after parsing, so that `--help` works everywhere.
 """
 
+import argparse
 import os
 import sys
 from typing import Callable, Iterable, Iterator, Optional, TypeVar
@@ -32,6 +33,14 @@ def run(main: Callable[[], Optional[int]]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 141
     sys.exit(code)
+
+
+def positive(text: str) -> int:
+    """The type of an argument that is a whole number of at least 1, for argparse."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be positive")
+    return value
 
 
 def require(*modules: str) -> None:
