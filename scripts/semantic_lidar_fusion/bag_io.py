@@ -23,7 +23,7 @@ from typing import (
 )
 
 from semantic_lidar_fusion import cli
-from semantic_lidar_fusion.errors import DataError
+from semantic_lidar_fusion.errors import DataError, cannot_write
 
 _RULE = "=" * 80 + "\n"
 _HEADER = """Header header
@@ -294,10 +294,7 @@ class BagWriter:
         try:
             self._bag = rosbag.Bag(self._file.temporary, "w", compression=compression)
         except OSError as error:
-            raise self._failed(error) from error
-
-    def _failed(self, error: OSError) -> DataError:
-        return DataError("%s: cannot be written (%s)" % (self.path, error.strerror or error))
+            raise cannot_write(self.path, error) from error
 
     def __enter__(self) -> "BagWriter":
         return self
@@ -318,7 +315,7 @@ class BagWriter:
         try:
             self._bag.write(topic, message, to_stamp(stamp_ns), connection_header=header)
         except OSError as error:
-            raise self._failed(error) from error
+            raise cannot_write(self.path, error) from error
 
     def write_raw(self, item: RawMessage) -> None:
         """Appends a message of another bag as it is."""
@@ -331,7 +328,7 @@ class BagWriter:
                 connection_header=dict(item.connection, topic=item.topic),
             )
         except OSError as error:
-            raise self._failed(error) from error
+            raise cannot_write(self.path, error) from error
 
     def __exit__(
         self,
@@ -345,7 +342,7 @@ class BagWriter:
                 self._file.commit()
         except OSError as close_error:
             if kind is None:
-                raise self._failed(close_error) from close_error
+                raise cannot_write(self.path, close_error) from close_error
         finally:
             self._file.discard()
 
@@ -358,6 +355,6 @@ def write_text(path: str, text: str) -> None:
             stream.write(text)
         file.commit()
     except OSError as error:
-        raise DataError("%s: cannot be written (%s)" % (path, error.strerror or error)) from error
+        raise cannot_write(path, error) from error
     finally:
         file.discard()

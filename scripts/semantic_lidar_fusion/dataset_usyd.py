@@ -19,7 +19,7 @@ from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 import yaml
 
 from semantic_lidar_fusion import bag_io, cli, dataset_writer
-from semantic_lidar_fusion.errors import ConfigError, DataError
+from semantic_lidar_fusion.errors import ConfigError, DataError, cannot_write
 from semantic_lidar_fusion.labels import LabelSet, load_yaml, package_file
 
 CAMERAS = ("A0", "A1", "A2", "B0", "B1")  # the paper's; A3 looks back
@@ -142,7 +142,7 @@ def write(source: str, bag_path: str, rig_path: str, labels: LabelSet, options: 
                 summary = _Import(reader, source, cameras, videos, options).run(writer)
             rig_file.commit()
         except OSError as error:
-            raise DataError("%s: cannot be written (%s)" % (rig_path, error)) from error
+            raise cannot_write(rig_path, error) from error
         finally:
             rig_file.discard()
     return summary

@@ -15,7 +15,7 @@ import yaml
 
 from semantic_lidar_fusion import bag_io, cli, cloud_io, poses
 from semantic_lidar_fusion import dataset_records as records
-from semantic_lidar_fusion.errors import ConfigError, DataError
+from semantic_lidar_fusion.errors import ConfigError, DataError, cannot_write
 from semantic_lidar_fusion.labels import NO_LABEL
 
 FIXED_FRAME = "odom"
@@ -82,9 +82,7 @@ def _write_temporary(file: bag_io.AtomicFile, text: str) -> None:
         with open(file.temporary, "w", encoding="utf-8") as stream:
             stream.write(text)
     except OSError as error:
-        raise DataError(
-            "%s: cannot be written (%s)" % (file.path, error.strerror or error)
-        ) from error
+        raise cannot_write(file.path, error) from error
 
 
 def _wait_s(drive: records.Drive) -> float:

@@ -16,3 +16,8 @@ class ConfigError(SemanticLidarFusionError):
 
 class MissingDependencyError(SemanticLidarFusionError):
     """A module that this interpreter cannot import."""
+
+
+def cannot_write(path: str, error: OSError) -> DataError:
+    """What to raise where a file cannot be written: names the file and the system's reason."""
+    return DataError("%s: cannot be written (%s)" % (path, error.strerror or error))

@@ -8,7 +8,7 @@ import numpy as np
 
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.bag_io import AtomicFile
-from semantic_lidar_fusion.errors import DataError
+from semantic_lidar_fusion.errors import DataError, cannot_write
 from semantic_lidar_fusion.metrics import Confusion, Reliability, ratio
 
 # Distinct for colour-blind eyes as well.
@@ -49,7 +49,7 @@ def save(figure: Any, path: str) -> None:
         figure.savefig(file.temporary, format="png", bbox_inches="tight", pad_inches=0.03)
         file.commit()
     except OSError as error:
-        raise DataError("%s: cannot be written (%s)" % (path, error.strerror or error)) from error
+        raise cannot_write(path, error) from error
     finally:
         file.discard()
         pyplot().close(figure)

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Dict, Iterator, List, NamedTuple, Sequence, Tu
 import numpy as np
 
 from semantic_lidar_fusion.bag_io import AtomicFile
-from semantic_lidar_fusion.errors import ConfigError, DataError
+from semantic_lidar_fusion.errors import ConfigError, DataError, cannot_write
 from semantic_lidar_fusion.labels import LabelSet
 from semantic_lidar_fusion.semantic_map import TILE_BITS, MapConfig, VoxelMap, record_dtype
 
@@ -89,10 +89,7 @@ class MapWriter:
             encoded = header.encoded()
             self._stream.write(_BEGIN + struct.pack("<Q", len(encoded)) + encoded)
         except OSError as error:
-            raise self._failed(error) from error
-
-    def _failed(self, error: OSError) -> DataError:
-        return DataError("%s: cannot be written (%s)" % (self.path, error.strerror or error))
+            raise cannot_write(self.path, error) from error
 
     def __enter__(self) -> "MapWriter":
         return self
@@ -106,7 +103,7 @@ class MapWriter:
         try:
             self._stream.write(np.ascontiguousarray(records).view(np.uint8))
         except OSError as error:
-            raise self._failed(error) from error
+            raise cannot_write(self.path, error) from error
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         try:
@@ -119,7 +116,7 @@ class MapWriter:
                 self._file.commit()
         except OSError as close_error:
             if kind is None:
-                raise self._failed(close_error) from close_error
+                raise cannot_write(self.path, close_error) from close_error
         finally:
             self._file.discard()
 

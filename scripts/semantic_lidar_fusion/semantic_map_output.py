@@ -5,7 +5,7 @@ import os
 import shutil
 from typing import Any, Dict, List
 
-from semantic_lidar_fusion.errors import DataError
+from semantic_lidar_fusion.errors import DataError, cannot_write
 from semantic_lidar_fusion.semantic_map_export import ABOUT_FILE, FILES, MAP_FILE, Exporter
 from semantic_lidar_fusion.semantic_map_file import MapReader
 from semantic_lidar_fusion.semantic_map_raster import Costs
@@ -39,11 +39,8 @@ class OutputFolder:
         try:
             os.mkdir(self.partial)
         except OSError as error:
-            raise self._failed(error) from error
+            raise cannot_write(self.path, error) from error
         return self
-
-    def _failed(self, error: OSError) -> DataError:
-        return DataError("%s: cannot be written (%s)" % (self.path, error.strerror or error))
 
     def discard(self) -> None:
         """Removes what is left of the partial folder: an interruption may come between making it
@@ -63,12 +60,12 @@ class OutputFolder:
                         os.rename(old, self.path)
                     raise
         except OSError as rename_error:
-            raise self._failed(rename_error) from rename_error
+            raise cannot_write(self.path, rename_error) from rename_error
         finally:
             shutil.rmtree(old, ignore_errors=True)
             self.discard()
         if kind is not None and issubclass(kind, OSError):
-            raise self._failed(error) from error
+            raise cannot_write(self.path, error) from error
 
 
 def export_map(
