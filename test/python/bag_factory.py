@@ -461,7 +461,20 @@ def write_bag(path: str, drive: Drive) -> None:
     messages.sort(key=lambda m: m[0])
     with rosbag.Bag(path, "w", compression=drive.compression) as bag:
         for time_ns, topic, message in messages:
-            bag.write(topic, message, stamp(time_ns))
+            header = latching_header(topic, message) if topic == "/tf_static" else None
+            bag.write(topic, message, stamp(time_ns), connection_header=header)
+
+
+def latching_header(topic: str, message) -> Dict[str, str]:
+    """Of a connection whose last message comes to late listeners too, as recorders note it."""
+    return {
+        "topic": topic,
+        "type": message._type,
+        "md5sum": message._md5sum,
+        "message_definition": message._full_text,
+        "callerid": "/bag_factory",
+        "latching": "1",
+    }
 
 
 def rig_text(drive: Drive, extra: str = "") -> str:

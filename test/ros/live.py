@@ -216,8 +216,14 @@ def connections_of(node, direction):
 
 
 def wait_for_chain(rig_topics, publisher, timeout=90.0):
-    """Waits until `publisher` is connected to listeners of all these topics."""
-    missing = lambda: set(rig_topics) - connections_of(publisher, "o")  # noqa: E731
+    """Waits until `publisher` is connected to listeners of all these topics, and the chain's last
+    link stands: nodelets share a connection, so that one of them may come after it."""
+
+    def missing():
+        return (set(rig_topics) - connections_of(publisher, "o")) | (
+            {"/scan_reference"} - connections_of(MANAGER, "o")
+        )
+
     wait_until(lambda: not missing(), lambda: "listeners of %s" % sorted(missing()), timeout)
 
 
