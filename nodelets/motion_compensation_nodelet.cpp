@@ -194,22 +194,21 @@ class MotionCompensationNodelet : public FusionNodelet {
   }
 
   void publishCompensated(const Scan& scan, StampNs t_ref, const TransformAnswer& T_vehicle_lidar) {
-    CompensationResult result;
     {
       const StageTimer timer(health(), "compensation");
       // Without extrinsics no pose of the lidar is known: the same as no odometry.
       static const PoseBuffer kNoOdometry;
-      result = compensate(
-          scan.cloud, t_ref, T_vehicle_lidar ? tf_->source().odometry() : kNoOdometry,
-          T_vehicle_lidar.transform.value_or(Transform::Identity()), rig().compensationConfig());
+      compensate(scan.cloud, t_ref, T_vehicle_lidar ? tf_->source().odometry() : kNoOdometry,
+                 T_vehicle_lidar.transform.value_or(Transform::Identity()),
+                 rig().compensationConfig(), &compensated_);
     }
-    const CompensationCounters& counters = result.counters;
-    health().count("points", result.cloud.size());
+    const CompensationCounters& counters = compensated_.counters;
+    health().count("points", compensated_.cloud.size());
     health().count("points without odometry: marked", counters.marked_points);
     health().count("points without odometry: dropped", counters.dropped_points);
     health().count("points without odometry: pose held", counters.held_points);
     health().count("points without odometry: pose extrapolated", counters.extrapolated_points);
-    publish(output_, compensatedCloudMessage(result.cloud));
+    publish(output_, compensatedCloudMessage(compensated_.cloud));
   }
 
   std::string explainSilence() override {
@@ -222,6 +221,7 @@ class MotionCompensationNodelet : public FusionNodelet {
   EpochMonitor epoch_;
   StampedStore<Reference> references_{kKnownReferences};
   std::deque<Scan> pending_;
+  CompensationResult compensated_;  // its arrays serve every scan
   StampNs longest_reference_wait_ns_ = 0;
   ros::Publisher output_;
   ros::Subscriber references_subscriber_, lidar_subscriber_;

@@ -15,6 +15,8 @@ namespace {
 constexpr double kSegmentAngle = 1e-3;
 /// Longest duration of a Segment: times within it are 32-bit nanoseconds.
 constexpr StampNs kSegmentNs = kNsPerSecond;
+/// Points that are worked on together.
+constexpr std::size_t kBlock = 256;
 
 /// T_a_b of two poses in one frame. The difference of the positions comes first, so that nothing is
 /// lost to large coordinates.
@@ -310,29 +312,66 @@ void transform(const Segment& segment, std::size_t count, const float* __restric
   }
 }
 
-/// Moves points [begin, end), whose poses lie in `segment`, each at its own time or all at
-/// `*pose_time`.
-void move(const TimedCloud& scan, std::size_t begin, std::size_t end, const Segment& segment,
-          const StampNs* pose_time, Cloud& cloud) {
-  Segment s = segment;
-  if (pose_time) {
-    const float ns = static_cast<float>(*pose_time - s.begin_ns);
-    for (int k = 0; k < 12; ++k) {
-      s.start[k] += ns * s.rate_per_ns[k];
-      s.rate_per_ns[k] = 0.0f;
-    }
+/// The leading ones of `count` points, at most kBlock, whose times lie in `segment`; `ns` gets
+/// their times since its begin.
+std::size_t timesWithin(const Segment& segment, const StampNs* times, std::size_t count,
+                        float* ns) {
+  const auto length = static_cast<std::uint64_t>(segment.end_ns - segment.begin_ns);
+  // Earlier times wrap to large numbers.
+  const auto since = [&](std::size_t i) {
+    return static_cast<std::uint64_t>(times[i]) - static_cast<std::uint64_t>(segment.begin_ns);
+  };
+  bool all = true;
+  for (std::size_t i = 0; i < count; ++i) {
+    all &= since(i) <= length;
+    ns[i] = static_cast<float>(static_cast<std::int32_t>(since(i)));
   }
-  // Times first, then coordinates: 64-bit integers keep compilers from using vector instructions.
-  constexpr std::size_t kBlock = 256;
+  if (all) return count;
+  std::size_t within = 0;
+  while (since(within) <= length) ++within;
+  return within;
+}
+
+/// Moves the points from `begin` on, each at its own time, as far as the segment of the first one
+/// reaches; returns how many.
+std::size_t moveByTime(const TimedCloud& scan, std::size_t begin, std::size_t end,
+                       const Segment& segment, Cloud& cloud) {
   float ns[kBlock];
-  for (; begin < end; begin += kBlock) {
-    const std::size_t count = std::min(kBlock, end - begin);
-    for (std::size_t i = 0; i < count; ++i) {
-      ns[i] = static_cast<float>(static_cast<std::int32_t>(scan.time_ns[begin + i] - s.begin_ns));
-    }
-    transform(s, count, ns, scan.x.data() + begin, scan.y.data() + begin, scan.z.data() + begin,
-              cloud.x.data() + begin, cloud.y.data() + begin, cloud.z.data() + begin);
+  std::size_t moved = 0, wanted = 0, within = 0;
+  do {
+    const std::size_t from = begin + moved;
+    wanted = std::min(kBlock, end - from);
+    within = timesWithin(segment, scan.time_ns.data() + from, wanted, ns);
+    // A point out of its firing's time takes the segment that is nearest.
+    if (moved == 0) within = std::max(within, std::size_t{1});
+    transform(segment, within, ns, scan.x.data() + from, scan.y.data() + from, scan.z.data() + from,
+              cloud.x.data() + from, cloud.y.data() + from, cloud.z.data() + from);
+    moved += within;
+  } while (within == wanted && begin + moved < end);
+  return moved;
+}
+
+/// Moves points [begin, end) at one time, in `segment`.
+void moveAt(StampNs time, const TimedCloud& scan, std::size_t begin, std::size_t end,
+            const Segment& segment, Cloud& cloud) {
+  Segment still = segment;
+  const float ns = static_cast<float>(time - segment.begin_ns);
+  for (int k = 0; k < 12; ++k) {
+    still.start[k] += ns * still.rate_per_ns[k];
+    still.rate_per_ns[k] = 0.0f;
   }
+  const float zeros[kBlock] = {};
+  for (; begin < end; begin += kBlock) {
+    transform(still, std::min(kBlock, end - begin), zeros, scan.x.data() + begin,
+              scan.y.data() + begin, scan.z.data() + begin, cloud.x.data() + begin,
+              cloud.y.data() + begin, cloud.z.data() + begin);
+  }
+}
+
+void keep(const TimedCloud& scan, std::size_t i, Cloud& cloud) {
+  cloud.x[i] = scan.x[i];
+  cloud.y[i] = scan.y[i];
+  cloud.z[i] = scan.z[i];
 }
 
 void moveAll(const TimedCloud& scan, const Plan& plan, Track& track, Cloud& cloud) {
@@ -343,19 +382,20 @@ void moveAll(const TimedCloud& scan, const Plan& plan, Track& track, Cloud& clou
     return all_move || plan.fates[scan.firing[i]] == Fate::kMove;
   };
   for (std::size_t i = 0; i < scan.size();) {
-    std::size_t end = i + 1;
-    if (moves(i)) {
-      // The longest run of points that share a segment.
-      const StampNs* const pose_time = by_packet ? &plan.packet_times[scan.firing[i]] : nullptr;
-      const Segment& segment = track.find(by_packet ? *pose_time : scan.time_ns[i]);
-      const auto shares_segment = [&](std::size_t j) {
-        return by_packet ? plan.packet_times[scan.firing[j]] == *pose_time
-                         : segment.contains(scan.time_ns[j]);
-      };
-      while (end < scan.size() && shares_segment(end) && moves(end)) ++end;
-      move(scan, i, end, segment, pose_time, cloud);
+    if (!moves(i)) {
+      keep(scan, i++, cloud);
+      continue;
     }
-    i = end;
+    std::size_t end = all_move && !by_packet ? scan.size() : i + 1;
+    if (by_packet) {
+      const StampNs time = plan.packet_times[scan.firing[i]];
+      while (end < scan.size() && plan.packet_times[scan.firing[end]] == time && moves(end)) ++end;
+      moveAt(time, scan, i, end, track.find(time), cloud);
+      i = end;
+    } else {
+      while (end < scan.size() && moves(end)) ++end;
+      while (i < end) i += moveByTime(scan, i, end, track.find(scan.time_ns[i]), cloud);
+    }
   }
 }
 
@@ -409,32 +449,40 @@ void secondsSince(StampNs reference_ns, const std::vector<StampNs>& times, const
   }
 }
 
-Cloud asMeasured(const TimedCloud& scan, StampNs reference_ns) {
+/// Everything but the coordinates and what odometry does to the status.
+void describe(const TimedCloud& scan, StampNs reference_ns, Cloud& cloud) {
   const ScanInterval span = scanInterval(scan);
-  Cloud cloud;
   cloud.frame_id = scan.frame_id;
   cloud.stamp = scan.empty() ? scan.header_stamp : reference_ns;
   cloud.first_point_ns = span.first_ns;
-  cloud.x = scan.x;
-  cloud.y = scan.y;
-  cloud.z = scan.z;
+  cloud.x.resize(scan.size());
+  cloud.y.resize(scan.size());
+  cloud.z.resize(scan.size());
   cloud.intensity = scan.intensity;
   cloud.ring = scan.ring;
   cloud.status.assign(scan.size(), static_cast<std::uint8_t>(PointStatus::kFused));
   secondsSince(reference_ns, scan.time_ns, span, cloud.dt);
-  return cloud;
+}
+
+void keepAll(const TimedCloud& scan, Cloud& cloud) {
+  cloud.x = scan.x;
+  cloud.y = scan.y;
+  cloud.z = scan.z;
 }
 
 }  // namespace
 
-CompensationResult compensate(const TimedCloud& scan, StampNs reference_ns,
-                              const PoseBuffer& odometry, const Transform& T_vehicle_lidar,
-                              const CompensationConfig& config) {
-  CompensationResult result;
-  Cloud& cloud = result.cloud;
-  CompensationCounters& counters = result.counters;
-  cloud = asMeasured(scan, reference_ns);
-  if (!config.enabled || scan.empty()) return result;
+void compensate(const TimedCloud& scan, StampNs reference_ns, const PoseBuffer& odometry,
+                const Transform& T_vehicle_lidar, const CompensationConfig& config,
+                CompensationResult* result) {
+  Cloud& cloud = result->cloud;
+  CompensationCounters& counters = result->counters;
+  counters = {};
+  describe(scan, reference_ns, cloud);
+  if (!config.enabled || scan.empty()) {
+    keepAll(scan, cloud);
+    return;
+  }
 
   const std::optional<Transform> T_fixed_vehicle_ref = odometry.lookup(reference_ns);
   counters.reference_covered = T_fixed_vehicle_ref.has_value();
@@ -444,11 +492,20 @@ CompensationResult compensate(const TimedCloud& scan, StampNs reference_ns,
   if (plan.first_ns <= plan.last_ns) {
     Track track = makeTrack(odometry, *T_fixed_vehicle_ref, T_vehicle_lidar, config, plan);
     moveAll(scan, plan, track, cloud);
+  } else {
+    keepAll(scan, cloud);
   }
   if (plan.uncovered_count > 0 || !counters.reference_covered) {
     markAndCount(scan, plan, config, cloud, counters);
     if (counters.dropped_points > 0) removeDropped(scan, plan.fates, cloud);
   }
+}
+
+CompensationResult compensate(const TimedCloud& scan, StampNs reference_ns,
+                              const PoseBuffer& odometry, const Transform& T_vehicle_lidar,
+                              const CompensationConfig& config) {
+  CompensationResult result;
+  compensate(scan, reference_ns, odometry, T_vehicle_lidar, config, &result);
   return result;
 }
 

@@ -55,7 +55,11 @@ struct CompensationResult {
 };
 
 /// All points of `scan` as seen from the lidar's pose at `reference_ns` (true time). The order of
-/// points is kept.
+/// points is kept. The arrays of `result` keep their memory from scan to scan: most of the time of
+/// a new result goes into that.
+void compensate(const TimedCloud& scan, StampNs reference_ns, const PoseBuffer& odometry,
+                const Transform& T_vehicle_lidar, const CompensationConfig& config,
+                CompensationResult* result);
 CompensationResult compensate(const TimedCloud& scan, StampNs reference_ns,
                               const PoseBuffer& odometry, const Transform& T_vehicle_lidar,
                               const CompensationConfig& config);
