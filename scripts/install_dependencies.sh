@@ -79,6 +79,17 @@ missing_of() {
     installed "$package" || echo "$package"
   done
 }
+# ROS reaches its own nodes by that name; a folder made by debootstrap lacks the file.
+if ! getent ahosts localhost >/dev/null; then
+  if [ ! -e /etc/hosts ] && [ "$(id -u)" -eq 0 ]; then
+    say "writing /etc/hosts, which is absent: localhost must have an address"
+    printf '127.0.0.1\tlocalhost\n' >/etc/hosts
+  else
+    say "localhost has no address: ROS needs the line '127.0.0.1 localhost' in /etc/hosts" >&2
+    exit 1
+  fi
+fi
+
 missing=$(missing_of $required)
 extra=$(missing_of $optional)
 if [ -z "$missing$extra" ]; then
