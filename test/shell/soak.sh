@@ -7,5 +7,5 @@ if [ ! -x "$SLF_BIN_DIR/simulate_drive" ]; then
   echo "simulate_drive is not built (Embree 3 is absent)"
   exit 77
 fi
-exec "$source_dir/scripts/soak.sh" "${SLF_SOAK_MINUTES:-0.8}" --warm-up 0.4 --scale 0.25 --duration 3 --rate 0.25 \
+exec "$source_dir/scripts/soak.sh" "${SLF_SOAK_MINUTES:-0.8}" --warm-up 0.4 --scale 0.25 --duration 2 --rate 0.25 \
   --growth-mb 40 --growth-percent 25 --drift-ms 500 --pairs-percent 90 --build-dir "$SLF_BUILD_DIR"
