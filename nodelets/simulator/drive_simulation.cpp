@@ -229,7 +229,8 @@ struct Scan {
   SimulatedScan simulated;
   TimedCloud cloud;  ///< as the package decodes it
   ScanInterval interval;
-  std::vector<std::uint16_t> visible, catchable, silhouette;  ///< bit i: PointView of camera i
+  /// Bit i: PointView of camera i.
+  std::vector<std::uint16_t> visible, catchable, apart, silhouette;
   std::vector<float> edge_px;  ///< point by point, the cameras in turn; negative: not seen
   StampNs record_ns = 0;
 };
@@ -288,7 +289,7 @@ class Simulation {
       }
       scan.interval = scanInterval(scan.cloud);
       scan.visible.assign(scan.cloud.size(), 0);
-      scan.catchable = scan.silhouette = scan.visible;
+      scan.catchable = scan.apart = scan.silhouette = scan.visible;
       scan.edge_px.assign(scan.cloud.size() * cameras_.size(), -1.0F);
       scans_.push_back(std::move(scan));
       checkpoint_();
@@ -448,6 +449,7 @@ class Simulation {
     const std::uint32_t flags_at = offset;
     addField("catchable", flags_at, sensor_msgs::PointField::UINT16, 2);
     addField("silhouette", flags_at + 2, sensor_msgs::PointField::UINT16, 2);
+    addField("apart", flags_at + 4, sensor_msgs::PointField::UINT16, 2);
     message.height = 1;
     message.width = static_cast<std::uint32_t>(scan.cloud.size());
     message.point_step = offset;
@@ -471,6 +473,7 @@ class Simulation {
       std::memcpy(point + 24, edges, 4 * cameras_.size());
       std::memcpy(point + flags_at, &scan.catchable[i], 2);
       std::memcpy(point + flags_at + 2, &scan.silhouette[i], 2);
+      std::memcpy(point + flags_at + 4, &scan.apart[i], 2);
     }
     return message;
   }
@@ -549,6 +552,7 @@ class Simulation {
           viewPoint(world_, returns, T_world_camera.translation(), echo.object, p_world);
       mark(&scan->visible[i], view.visible);
       mark(&scan->catchable[i], view.catchable);
+      mark(&scan->apart[i], view.apart);
       mark(&scan->silhouette[i], view.silhouette);
       if (!view.visible) continue;
       // Through a gap smaller than a pixel, the pixel's centre shows something else: an edge.

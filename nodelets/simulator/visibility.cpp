@@ -14,6 +14,8 @@ constexpr float kPi = 3.14159265358979323846F;
 constexpr float kRingRad = 2.0F * kPi / 180.0F;
 /// A camera sees a point if its ray meets nothing this much before it: share of the range, and m.
 constexpr double kSeenShare = 1e-4, kSeenM = 2e-3;
+/// The depth margin of OcclusionConfig's defaults: m, and share of the occluder's distance.
+constexpr double kMarginM = 0.3, kMarginShare = 0.1;
 /// A silhouette is a step in depth of at least this, m.
 constexpr double kSilhouetteM = 0.3;
 
@@ -97,6 +99,7 @@ PointView viewPoint(const World& world, const ReturnsAround& returns, const Eige
   } else {
     const Eigen::Vector3d met = eye + static_cast<double>(hit.range) * line / distance;
     view.catchable = returns.tellOf(hit.object, met, eye, distance);
+    view.apart = distance > hit.range + std::max(kMarginM, kMarginShare * hit.range);
   }
   return view;
 }

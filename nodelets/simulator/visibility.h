@@ -5,7 +5,8 @@
 /// Q be the place where the line of sight from the camera to the point first meets something, and O
 /// the object met. Seen from the lidar at the instant, a return of O, itself closer to the camera
 /// than the point, lies within one ring (2 deg) and one azimuth step (0.2 deg) of Q. Returns count
-/// where they were measured, also those of objects that have moved on since.
+/// where they were measured, also those of objects that have moved on since. A mask hides only what
+/// stands farther behind than its depth margin: such a point is *apart* from its occluder.
 #pragma once
 
 #include <Eigen/Geometry>
@@ -45,6 +46,7 @@ class ReturnsAround {
 struct PointView {
   bool visible = false;
   bool catchable = false;  ///< hidden, and the scan tells by what
+  bool apart = false;      ///< hidden, and farther behind what hides it than a rig's default margin
   bool silhouette =
       false;  ///< visible, within one ring and one azimuth step of something before it
 };

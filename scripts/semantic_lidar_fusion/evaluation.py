@@ -422,9 +422,8 @@ def mask_visibility(
             raise DataError(
                 "%s and %s: not the same scans, or no field cameras" % (unmasked.path, masked.path)
             )
-        result.add(
-            cameras[0], cameras[1], visible, scan.flags("catchable"), scan.flags("silhouette")
-        )
+        truths = (scan.flags(name) for name in ("catchable", "silhouette", "apart"))
+        result.add(cameras[0], cameras[1], visible, *truths)
     return result
 
 

@@ -170,6 +170,8 @@ class Visibility:
         self.seen = self.seen_lost = 0
         self.catchable = self.catchable_caught = 0
         self.has_catchable = False
+        self.apart = self.apart_caught = 0
+        self.has_apart = False
         self.beside = self.beside_lost = 0
         self.has_silhouette = False
 
@@ -180,11 +182,13 @@ class Visibility:
         visible: np.ndarray,
         catchable: np.ndarray = None,
         silhouette: np.ndarray = None,
+        apart: np.ndarray = None,
     ) -> None:
         """unmasked, masked: cameras that contributed without and with the mask; visible: cameras
         that really see the point; catchable: hidden from the camera by something that the lidar
         has measured beside the line of sight; silhouette: something stands before the point within
-        one ring and one azimuth step of the line of sight."""
+        one ring and one azimuth step of the line of sight; apart: farther behind what hides it than
+        the default depth margin, so that a mask may hide it (counts where catchable is given)."""
         lost = unmasked & ~masked
         hidden = unmasked & ~visible
         seen = unmasked & visible
@@ -196,6 +200,10 @@ class Visibility:
             self.has_catchable = True
             self.catchable += _bits(hidden & catchable)
             self.catchable_caught += _bits(hidden & catchable & lost)
+            if apart is not None:
+                self.has_apart = True
+                self.apart += _bits(hidden & catchable & apart)
+                self.apart_caught += _bits(hidden & catchable & apart & lost)
         if silhouette is not None:
             self.has_silhouette = True
             self.beside += _bits(seen & silhouette)
@@ -209,6 +217,9 @@ class Visibility:
         if self.has_catchable:
             share = float(ratio(self.catchable_caught, self.catchable))
             result.append(["catchable hidden points caught", self.catchable, share])
+        if self.has_apart:
+            share = float(ratio(self.apart_caught, self.apart))
+            result.append(["of these, beyond the depth margin", self.apart, share])
         result.append(["visible points lost", self.seen, float(ratio(self.seen_lost, self.seen))])
         if self.has_silhouette:
             for name, count, gone in (

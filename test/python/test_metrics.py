@@ -232,6 +232,10 @@ def test_visibility_by_hand():
     visibility.add(unmasked, masked, visible, catchable)
     assert visibility.rows()[1] == ["catchable hidden points caught", 1, 1.0]
     assert visibility.hidden == 4 and visibility.seen_lost == 2
+    near = Visibility()
+    near.add(unmasked, masked, visible, catchable, apart=np.zeros(4, dtype=np.uint16))
+    near.add(unmasked, masked, visible, catchable, apart=np.full(4, 0b0001, dtype=np.uint16))
+    assert near.rows()[2] == ["of these, beyond the depth margin", 1, 1.0]
     # The point whose bit 3 is lost stands beside a silhouette of camera 3, and another not in view.
     silhouette = np.array([0b0000, 0b0000, 0b1000, 0b0001], dtype=np.uint16)
     beside = Visibility()
