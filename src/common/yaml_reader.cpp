@@ -50,6 +50,24 @@ bool nestsTooDeeply(const std::string& text) {
   return false;
 }
 
+/// yaml-cpp before 0.7 never ends where, within brackets, `]` or the end of the text follows a
+/// colon directly: the one is refused (in strings and comments too: the guard must not be led
+/// astray), a line's end helps against the other.
+std::string harmless(const std::string& text, const std::string& source_name) {
+#ifdef SLF_OLD_YAML_CPP
+  const std::size_t at = text.find(":]");
+  if (at != std::string::npos) {
+    const auto end = text.begin() + static_cast<std::ptrdiff_t>(at);
+    fail(source_name + ":" + std::to_string(1 + std::count(text.begin(), end, '\n')),
+         "':]' must have a blank within");
+  }
+  return text + "\n";
+#else
+  static_cast<void>(source_name);
+  return text;
+#endif
+}
+
 class IgnoreEvents : public YAML::EventHandler {
  public:
   void OnDocumentStart(const YAML::Mark&) override {}
@@ -152,11 +170,12 @@ YAML::Node copyTree(const YAML::Node& node, const std::string& source_name) {
   return copyNode(node, 0, &nodes, source_name);
 }
 
-YAML::Node parseYaml(const std::string& text, const std::string& source_name) {
-  if (text.size() > kMaxBytes) {
+YAML::Node parseYaml(const std::string& given, const std::string& source_name) {
+  if (given.size() > kMaxBytes) {
     fail(source_name, "is longer than " + std::to_string(kMaxBytes) + " bytes");
   }
-  if (nestsTooDeeply(text)) fail(source_name, "nests too deeply for a configuration");
+  if (nestsTooDeeply(given)) fail(source_name, "nests too deeply for a configuration");
+  const std::string text = harmless(given, source_name);
   YAML::Node root;
   try {
     const int documents = countDocuments(text);

@@ -52,6 +52,18 @@ TEST(ParseYamlTest, RefusesWhatCouldExhaustStackOrMemory) {
   EXPECT_NE(problemOf(",%%").find("one YAML document"), std::string::npos);
 }
 
+/// Each text is one that a version of yaml-cpp never ends on, if nothing is done.
+TEST(ParseYamlTest, EndsOnEveryText) {
+  for (const char* text : {",", "{a:]", "{a:", "[a:]", "[a:", "b: {c: d, e:] f}\n"}) {
+    try {
+      parseYaml(text, "rig.yaml");
+    } catch (const ConfigError& error) {
+      EXPECT_NE(std::string(error.what()).find("rig.yaml"), std::string::npos) << text;
+    }
+  }
+  EXPECT_TRUE(parseYaml("a:", "rig.yaml")["a"].IsNull());
+}
+
 TEST(ParseYamlTest, AliasesBecomeCopies) {
   YAML::Node root = parseYaml("a: &a {x: 1}\nb: *a\n", "rig.yaml");
   root["b"]["x"] = 2;
