@@ -48,7 +48,7 @@ class Demo(live.ReplayCase):
                 evaluation_folder=online,
                 overrides=" ".join(OVERRIDES),
             ) as launch:
-                live.wait_until(lambda: launch.poll() is not None, "the end of the demo", 180.0)
+                live.wait_until(lambda: launch.poll() is not None, "the end of the demo", 700.0)
             settings = ["--set=" + override for override in OVERRIDES]
             fused = os.path.join(path, "fused.bag")
             free_running = "--set=segmentation.mode=free_running"
