@@ -52,7 +52,7 @@ bool nestsTooDeeply(const std::string& text) {
 
 /// yaml-cpp before 0.7 never ends where, within brackets, `]` or the end of the text follows a
 /// colon directly: the one is refused (in strings and comments too: the guard must not be led
-/// astray), a line's end helps against the other.
+/// astray), a blank helps against the other.
 std::string harmless(const std::string& text, const std::string& source_name) {
 #ifdef SLF_OLD_YAML_CPP
   const std::size_t at = text.find(":]");
@@ -61,7 +61,7 @@ std::string harmless(const std::string& text, const std::string& source_name) {
     fail(source_name + ":" + std::to_string(1 + std::count(text.begin(), end, '\n')),
          "':]' must have a blank within");
   }
-  return text + "\n";
+  return text + " ";
 #else
   static_cast<void>(source_name);
   return text;
