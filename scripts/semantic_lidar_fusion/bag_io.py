@@ -294,7 +294,11 @@ class BagWriter:
         try:
             self._bag = rosbag.Bag(self._file.temporary, "w", compression=compression)
         except OSError as error:
+            self._file.discard()
             raise cannot_write(self.path, error) from error
+        except BaseException:  # an interrupt: no block is entered that would clean up
+            self._file.discard()
+            raise
 
     def __enter__(self) -> "BagWriter":
         return self

@@ -89,7 +89,11 @@ class MapWriter:
             encoded = header.encoded()
             self._stream.write(_BEGIN + struct.pack("<Q", len(encoded)) + encoded)
         except OSError as error:
+            self._file.discard()
             raise cannot_write(self.path, error) from error
+        except BaseException:  # an interrupt: no block is entered that would clean up
+            self._file.discard()
+            raise
 
     def __enter__(self) -> "MapWriter":
         return self

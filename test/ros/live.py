@@ -215,13 +215,13 @@ def connections_of(node, direction):
     return {entry[4] for entry in info if entry[2] == direction and (len(entry) < 6 or entry[5])}
 
 
-def wait_for_chain(rig_topics, publisher, timeout=90.0):
+def wait_for_chain(rig_topics, publisher, timeout=90.0, manager=MANAGER):
     """Waits until `publisher` is connected to listeners of all these topics, and the chain's last
     link stands: nodelets share a connection, so that one of them may come after it."""
 
     def missing():
         return (set(rig_topics) - connections_of(publisher, "o")) | (
-            {"/scan_reference"} - connections_of(MANAGER, "o")
+            {"/scan_reference"} - connections_of(manager, "o")
         )
 
     wait_until(lambda: not missing(), lambda: "listeners of %s" % sorted(missing()), timeout)

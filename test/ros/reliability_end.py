@@ -60,7 +60,7 @@ class End(unittest.TestCase):
                     for name, kind in TYPES.items()
                 ]
                 try:
-                    live.wait_for_chain(publishers, rospy.get_name(), 60.0)
+                    live.wait_for_chain(publishers, rospy.get_name(), 60.0, "/ending")
                     semantic.clear()
                     shift = rospy.Duration(20 * index)
                     for count, (_, topic, original) in enumerate(messages):
