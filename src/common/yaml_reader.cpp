@@ -50,16 +50,22 @@ bool nestsTooDeeply(const std::string& text) {
   return false;
 }
 
-/// yaml-cpp before 0.7 never ends where, within brackets, `]` or the end of the text follows a
-/// colon directly: the one is refused (in strings and comments too: the guard must not be led
-/// astray), a blank helps against the other.
+/// yaml-cpp before 0.7 never ends where, within brackets, `]`, a control character (one of which
+/// stands for the end of the text) or the end itself follows a colon directly: what YAML does not
+/// have is refused, in strings and comments too (the guard must not be led astray), and a blank
+/// helps against the last.
 std::string harmless(const std::string& text, const std::string& source_name) {
 #ifdef SLF_OLD_YAML_CPP
-  const std::size_t at = text.find(":]");
-  if (at != std::string::npos) {
-    const auto end = text.begin() + static_cast<std::ptrdiff_t>(at);
-    fail(source_name + ":" + std::to_string(1 + std::count(text.begin(), end, '\n')),
-         "':]' must have a blank within");
+  std::size_t line = 1;
+  for (std::size_t i = 0; i < text.size(); ++i) {
+    const auto c = static_cast<unsigned char>(text[i]);
+    line += c == '\n';
+    const auto place = [&] { return source_name + ":" + std::to_string(line); };
+    if (c < ' ' && c != '\t' && c != '\n' && c != '\r') {
+      fail(place(),
+           "control character " + std::to_string(c) + "; YAML has none but tabs and ends of line");
+    }
+    if (c == ']' && i > 0 && text[i - 1] == ':') fail(place(), "':]' must have a blank within");
   }
   return text + " ";
 #else

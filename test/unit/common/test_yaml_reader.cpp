@@ -54,7 +54,7 @@ TEST(ParseYamlTest, RefusesWhatCouldExhaustStackOrMemory) {
 
 /// Each text is one that a version of yaml-cpp never ends on, if nothing is done.
 TEST(ParseYamlTest, EndsOnEveryText) {
-  for (const char* text : {",", "{a:]", "{a:", "[a:]", "[a:", "b: {c: d, e:] f}\n"}) {
+  for (const char* text : {",", "{a:]", "{a:", "[a:]", "[a:", "[a:\x04 b]", "b: {c: d, e:] f}\n"}) {
     try {
       parseYaml(text, "rig.yaml");
     } catch (const ConfigError& error) {
