@@ -33,6 +33,10 @@ sys.path.insert(0, os.path.join(SOURCE_DIR, "test", "python"))
 
 import bag_factory  # noqa: E402,F401
 
+if not hasattr(threading.Thread, "isAlive"):
+    # The rospy of Debian 11 calls it at the end; Python 3.9 has no such name any more.
+    threading.Thread.isAlive = threading.Thread.is_alive
+
 MANAGER = "/fusion_manager"
 
 
