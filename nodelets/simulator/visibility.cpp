@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "semantic_lidar_fusion/lidar/firing_times.h"
+#include "semantic_lidar_fusion/projection/occlusion_config.h"
 
 namespace semantic_lidar_fusion {
 namespace simulator {
@@ -14,8 +15,6 @@ constexpr float kPi = 3.14159265358979323846F;
 constexpr float kRingRad = 2.0F * kPi / 180.0F;
 /// A camera sees a point if its ray meets nothing this much before it: share of the range, and m.
 constexpr double kSeenShare = 1e-4, kSeenM = 2e-3;
-/// The depth margin of OcclusionConfig's defaults: m, and share of the occluder's distance.
-constexpr double kMarginM = 0.3, kMarginShare = 0.1;
 /// A silhouette is a step in depth of at least this, m.
 constexpr double kSilhouetteM = 0.3;
 
@@ -99,7 +98,9 @@ PointView viewPoint(const World& world, const ReturnsAround& returns, const Eige
   } else {
     const Eigen::Vector3d met = eye + static_cast<double>(hit.range) * line / distance;
     view.catchable = returns.tellOf(hit.object, met, eye, distance);
-    view.apart = distance > hit.range + std::max(kMarginM, kMarginShare * hit.range);
+    const OcclusionConfig mask;
+    view.apart =
+        distance > hit.range + std::max(mask.depth_margin_m, mask.depth_margin_ratio * hit.range);
   }
   return view;
 }

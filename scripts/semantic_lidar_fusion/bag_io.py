@@ -6,6 +6,7 @@ is well, so that a bag with the wanted name is always a whole one. Messages of v
 read and written whether or not that package is installed.
 """
 
+import contextlib
 import os
 import struct
 from types import TracebackType
@@ -264,6 +265,18 @@ class AtomicFile:
             folder, ".%s.%d.partial" % (os.path.basename(path), os.getpid())
         )
 
+    @contextlib.contextmanager
+    def opening(self) -> Iterator[None]:
+        """For a writer's constructor: if the block fails or is interrupted, no context has been
+        entered yet that would clean up. DataError if the file cannot be written."""
+        try:
+            yield
+        except BaseException as error:
+            self.discard()
+            if isinstance(error, OSError):
+                raise cannot_write(self.path, error) from error
+            raise
+
     def commit(self) -> None:
         os.replace(self.temporary, self.path)
 
@@ -291,14 +304,8 @@ class BagWriter:
                 compression = "none"
         self.path = path
         self._file = AtomicFile(path)
-        try:
+        with self._file.opening():
             self._bag = rosbag.Bag(self._file.temporary, "w", compression=compression)
-        except OSError as error:
-            self._file.discard()
-            raise cannot_write(self.path, error) from error
-        except BaseException:  # an interrupt: no block is entered that would clean up
-            self._file.discard()
-            raise
 
     def __enter__(self) -> "BagWriter":
         return self

@@ -84,16 +84,10 @@ class MapWriter:
         self.path = path
         self._tiles: List[Tuple[int, int, int]] = []
         self._file = AtomicFile(path)
-        try:
+        with self._file.opening():
             self._stream: BinaryIO = open(self._file.temporary, "wb")
             encoded = header.encoded()
             self._stream.write(_BEGIN + struct.pack("<Q", len(encoded)) + encoded)
-        except OSError as error:
-            self._file.discard()
-            raise cannot_write(self.path, error) from error
-        except BaseException:  # an interrupt: no block is entered that would clean up
-            self._file.discard()
-            raise
 
     def __enter__(self) -> "MapWriter":
         return self

@@ -386,13 +386,14 @@ void moveAll(const TimedCloud& scan, const Plan& plan, Track& track, Cloud& clou
       keep(scan, i++, cloud);
       continue;
     }
-    std::size_t end = all_move && !by_packet ? scan.size() : i + 1;
+    std::size_t end = i + 1;
     if (by_packet) {
       const StampNs time = plan.packet_times[scan.firing[i]];
       while (end < scan.size() && plan.packet_times[scan.firing[end]] == time && moves(end)) ++end;
       moveAt(time, scan, i, end, track.find(time), cloud);
       i = end;
     } else {
+      if (all_move) end = scan.size();
       while (end < scan.size() && moves(end)) ++end;
       while (i < end) i += moveByTime(scan, i, end, track.find(scan.time_ns[i]), cloud);
     }

@@ -10,7 +10,6 @@
 #include <sensor_msgs/PointCloud2.h>
 #include <sensor_msgs/point_cloud2_iterator.h>
 #include <tf2_msgs/TFMessage.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <atomic>
@@ -22,6 +21,8 @@
 #include <string>
 #include <thread>
 #include <vector>
+
+#include "temporary_folder.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -125,9 +126,8 @@ class Traffic {
 };
 
 TEST(Lifecycle, LoadsAndUnloadsUnderLoad) {
-  char folder[] = "/tmp/slf_lifecycle_XXXXXX";
-  ASSERT_NE(mkdtemp(folder), nullptr);
-  const std::string rig = std::string(folder) + "/rig.yaml";
+  const TemporaryFolder folder;
+  const std::string rig = folder.path() + "/rig.yaml";
   std::ofstream(rig) << "classes: {classes: [{name: road, color: [1, 2, 3]}, "
                         "{name: wall, color: [4, 5, 6]}, {name: sky, color: [7, 8, 9]}]}\n"
                         "cameras: [{name: front}]\nlidar: {input: points}\n"

@@ -12,7 +12,6 @@
 #include <sensor_msgs/TimeReference.h>
 #include <sensor_msgs/point_cloud2_iterator.h>
 #include <tf2_msgs/TFMessage.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <cstring>
@@ -25,6 +24,7 @@
 #include <vector>
 
 #include "../unit/segmentation/onnx_writer.h"
+#include "temporary_folder.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -41,11 +41,6 @@ bool waitFor(const std::function<bool()>& condition, double timeout_s = 20.0) {
     ros::WallDuration(0.005).sleep();
   }
   return condition();
-}
-
-std::string temporaryFolder() {
-  char path[] = "/tmp/slf_chain_XXXXXX";
-  return mkdtemp(path);
 }
 
 /// Writes a rig of two cameras; `extra` is appended.
@@ -196,8 +191,8 @@ class Witness {
 };
 
 TEST(ZeroCopy, MessagesPassByPointerAndAreNotChanged) {
-  const std::string folder = temporaryFolder();
-  Chain chain("zero_copy", {std::begin(kTypes), std::end(kTypes)}, rigFile(folder));
+  const TemporaryFolder folder;
+  Chain chain("zero_copy", {std::begin(kTypes), std::end(kTypes)}, rigFile(folder.path()));
   ros::NodeHandle& node = chain.node();
   ros::Publisher tf = node.advertise<tf2_msgs::TFMessage>("/tf", 10);
   ros::Publisher tf_static = node.advertise<tf2_msgs::TFMessage>("/tf_static", 10, true);
@@ -326,16 +321,17 @@ class Laziness : public testing::TestWithParam<Lazy> {};
 
 TEST_P(Laziness, SubscribesOnlyWhileListenedTo) {
   const Lazy& lazy = GetParam();
-  const std::string folder = temporaryFolder();
+  const TemporaryFolder folder;
   std::string extra;
   if (std::string(lazy.type) == "Segmentation") {
-    writeConvolution(folder + "/net.onnx", kWidth, kHeight, 1, std::vector<float>(9, 0.01f),
+    writeConvolution(folder.path() + "/net.onnx", kWidth, kHeight, 1, std::vector<float>(9, 0.01f),
                      {0, 0, 0});
-    std::ofstream(folder + "/model.yaml") << "file: net.onnx\ninput: {width: 64, height: 48}\n"
-                                             "classes: {road: [0], wall: [1], sky: [2]}\n";
+    std::ofstream(folder.path() + "/model.yaml")
+        << "file: net.onnx\ninput: {width: 64, height: 48}\n"
+           "classes: {road: [0], wall: [1], sky: [2]}\n";
     extra = "segmentation: {model: model.yaml}\n";
   }
-  Chain chain("lazy_" + nameOf(lazy), {lazy.type}, rigFile(folder, extra));
+  Chain chain("lazy_" + nameOf(lazy), {lazy.type}, rigFile(folder.path(), extra));
   ros::NodeHandle& node = chain.node();
   std::vector<ros::Publisher> inputs;
   for (const auto& topic : lazy.images)
@@ -436,8 +432,8 @@ INSTANTIATE_TEST_SUITE_P(
     [](const testing::TestParamInfo<Lazy>& info) { return nameOf(info.param); });
 
 TEST(Laziness, ALastListenerStopsTheWholeChain) {
-  const std::string folder = temporaryFolder();
-  Chain chain("lazy_chain", {std::begin(kTypes), std::end(kTypes)}, rigFile(folder));
+  const TemporaryFolder folder;
+  Chain chain("lazy_chain", {std::begin(kTypes), std::end(kTypes)}, rigFile(folder.path()));
   ros::NodeHandle& node = chain.node();
   ros::Publisher cloud = node.advertise<sensor_msgs::PointCloud2>("points", 1);
   ros::Publisher picture = node.advertise<sensor_msgs::Image>("left/image", 1);
@@ -458,14 +454,15 @@ TEST(Laziness, ALastListenerStopsTheWholeChain) {
 }
 
 TEST(Segmentation, EveryImageIsAnsweredAndTheNewestByTheNetwork) {
-  const std::string folder = temporaryFolder();
+  const TemporaryFolder folder;
   // Score of class c = weight * mean of the channels + bias of c.
-  writeConvolution(folder + "/net.onnx", kWidth, kHeight, 1, {0.5f, 0, 0, 0, 0.5f, 0, 0, 0, 0.5f},
-                   {1, 2, 3});
-  std::ofstream(folder + "/model.yaml")
+  writeConvolution(folder.path() + "/net.onnx", kWidth, kHeight, 1,
+                   {0.5f, 0, 0, 0, 0.5f, 0, 0, 0, 0.5f}, {1, 2, 3});
+  std::ofstream(folder.path() + "/model.yaml")
       << "file: net.onnx\ninput: {width: 64, height: 48, channels: bgr, scale: 1}\n"
          "classes: {road: [0], wall: [1], sky: [2]}\n";
-  Chain chain("network", {"Segmentation"}, rigFile(folder, "segmentation: {model: model.yaml}\n"));
+  Chain chain("network", {"Segmentation"},
+              rigFile(folder.path(), "segmentation: {model: model.yaml}\n"));
   ros::NodeHandle& node = chain.node();
   ros::Publisher images = node.advertise<sensor_msgs::Image>("front/image_selected", 20);
   std::vector<sensor_msgs::ImageConstPtr> scores;

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: MIT
 #include <dirent.h>
 #include <gtest/gtest.h>
-#include <unistd.h>
 #include <yaml-cpp/yaml.h>
 
 #include <algorithm>
@@ -22,6 +21,7 @@
 #include "optional_data.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/segmentation/model.h"
+#include "temporary_folder.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -35,19 +35,7 @@ LabelSet classSet(const std::vector<std::string>& names) {
 
 class SegmentationModelTest : public ::testing::Test {
  protected:
-  SegmentationModelTest() {
-    std::string pattern = ::testing::TempDir() + "slf_model_XXXXXX";
-    directory_ = mkdtemp(&pattern[0]);
-  }
-  ~SegmentationModelTest() override {
-    for (const std::string& file : files_) std::remove(file.c_str());
-    rmdir(directory_.c_str());
-  }
-
-  std::string path(const std::string& name) {
-    files_.insert(directory_ + "/" + name);
-    return directory_ + "/" + name;
-  }
+  std::string path(const std::string& name) const { return folder_.path() + "/" + name; }
   std::string writeModelFile(const std::string& text) {
     const std::string file = path("model.yaml");
     std::ofstream(file) << text;
@@ -68,8 +56,7 @@ class SegmentationModelTest : public ::testing::Test {
   }
 
  private:
-  std::string directory_;
-  std::set<std::string> files_;
+  const TemporaryFolder folder_;
 };
 
 void expectProblem(const std::vector<std::string>& problems, const std::string& part) {
