@@ -385,7 +385,7 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
   });
   BeamGrid grid;
   if (any_image && !cloud.empty() && config_.occlusion.mode != OcclusionMode::kOff) {
-    grid = beamGrid(cloud, config_.occlusion);
+    grid = beamGrid(cloud, config_.occlusion, pool_.get());
   }
 
   std::vector<CameraOutcome> outcomes(views.size());

@@ -4,10 +4,12 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <functional>
 #include <limits>
 #include <numeric>
 
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/thread_pool.h"
 
 namespace semantic_lidar_fusion {
 
@@ -67,6 +69,15 @@ float quickAtan2(float y, float x) {
   return y < 0.0f ? -r : r;
 }
 
+/// Calls work(0), ..., work(rows - 1), on the threads of `pool` if there is one.
+void forEachRow(int rows, ThreadPool* pool, const std::function<void(int)>& work) {
+  if (pool != nullptr) {
+    pool->forEach(rows, work);
+    return;
+  }
+  for (int row = 0; row < rows; ++row) work(row);
+}
+
 /// A cloud as rows of returns sorted by azimuth. A return's *place* is its index in these arrays.
 struct RangeImage {
   std::vector<float> x, y, z, azimuth, range;
@@ -114,7 +125,7 @@ void sortRow(Key* keys, std::uint32_t count) {
 }
 
 /// `rows` gets the row of each point, kNoRing = not used.
-RangeImage rangeImage(const Cloud& cloud, const OcclusionConfig& config,
+RangeImage rangeImage(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool,
                       std::vector<std::uint16_t>* rows) {
   const std::size_t n = cloud.size();
   std::vector<float> azimuth(n), range(n);
@@ -172,22 +183,22 @@ RangeImage rangeImage(const Cloud& cloud, const OcclusionConfig& config,
     if ((*rows)[i] == kNoRing) continue;
     keys[next[(*rows)[i]]++] = {azimuth[i], static_cast<std::uint32_t>(i)};
   }
-  for (int row = 0; row < row_count; ++row) {
-    sortRow(keys.data() + image.row_begin[row], image.count(row));
-  }
   for (std::vector<float>* values : {&image.x, &image.y, &image.z, &image.azimuth, &image.range}) {
     values->resize(keys.size());
   }
   image.index.resize(keys.size());
-  for (std::size_t place = 0; place < keys.size(); ++place) {
-    const std::uint32_t i = keys[place].index;
-    image.index[place] = i;
-    image.azimuth[place] = keys[place].azimuth;
-    image.range[place] = range[i];
-    image.x[place] = cloud.x[i];
-    image.y[place] = cloud.y[i];
-    image.z[place] = cloud.z[i];
-  }
+  forEachRow(row_count, pool, [&](int row) {
+    sortRow(keys.data() + image.row_begin[row], image.count(row));
+    for (std::uint32_t place = image.row_begin[row]; place < image.row_begin[row + 1]; ++place) {
+      const std::uint32_t i = keys[place].index;
+      image.index[place] = i;
+      image.azimuth[place] = keys[place].azimuth;
+      image.range[place] = range[i];
+      image.x[place] = cloud.x[i];
+      image.y[place] = cloud.y[i];
+      image.z[place] = cloud.z[i];
+    }
+  });
   return image;
 }
 
@@ -226,18 +237,18 @@ double azimuthStep(std::vector<float>* steps) {
   return median(steps);
 }
 
-void measureSteps(const RangeImage& image, const OcclusionConfig& config, BeamGrid* grid) {
+void measureSteps(const RangeImage& image, const OcclusionConfig& config, ThreadPool* pool,
+                  BeamGrid* grid) {
   constexpr std::size_t kEnough = 50;
   constexpr std::uint32_t kElevations = 256;  // a sample is enough for a median
-  const int rows = image.rows();
-  grid->rings.assign(static_cast<std::size_t>(rows), {});
-  std::vector<float> all, values, steps_of_rings;
-  std::vector<int> present;
-  for (int row = 0; row < rows; ++row) {
+  const auto rows = static_cast<std::size_t>(image.rows());
+  grid->rings.assign(rows, {});
+  std::vector<std::vector<float>> few(rows);  // the steps of rows that are too short for a median
+  forEachRow(image.rows(), pool, [&](int row) {
     const std::uint32_t begin = image.row_begin[row], end = image.row_begin[row + 1];
-    if (begin == end) continue;
-    present.push_back(row);
-    values.clear();
+    if (begin == end) return;
+    std::vector<float> values;
+    values.reserve(end - begin);
     for (std::uint32_t i = begin; i < end; i += 1 + (end - begin) / kElevations) {
       values.push_back(image.elevation(i));
     }
@@ -247,12 +258,19 @@ void measureSteps(const RangeImage& image, const OcclusionConfig& config, BeamGr
       values.push_back(image.azimuth[i] - image.azimuth[i - 1]);
     }
     if (values.size() >= kEnough) {
-      const double step = azimuthStep(&values);
-      grid->rings[row].half_azimuth_rad = 0.5 * step;
-      if (step > 0.0) steps_of_rings.push_back(static_cast<float>(step));
+      grid->rings[row].half_azimuth_rad = 0.5 * azimuthStep(&values);
     } else {
-      all.insert(all.end(), values.begin(), values.end());
+      few[row] = std::move(values);
     }
+  });
+  std::vector<float> all, steps_of_rings;
+  std::vector<int> present;
+  for (int row = 0; row < image.rows(); ++row) {
+    if (image.count(row) == 0) continue;
+    present.push_back(row);
+    all.insert(all.end(), few[row].begin(), few[row].end());
+    const double half_step = grid->rings[row].half_azimuth_rad;
+    if (half_step > 0.0) steps_of_rings.push_back(static_cast<float>(2.0 * half_step));
   }
   if (present.empty()) return;
 
@@ -301,7 +319,7 @@ class Linker {
   Linker(const RangeImage& image, const OcclusionConfig& config, const BeamGrid& grid)
       : image_(image), config_(config), grid_(grid) {}
 
-  void link() {
+  void link(ThreadPool* pool) {
     near_.assign(image_.index.size(), {kNone, kNone, kNone, kNone});
     links_ = near_;
     for (int row = 0; row < image_.rows(); ++row) {
@@ -310,24 +328,28 @@ class Linker {
     std::stable_sort(rows_.begin(), rows_.end(), [&](int a, int b) {
       return grid_.rings[a].elevation_rad < grid_.rings[b].elevation_rad;
     });
-    for (std::size_t k = 0; k < rows_.size(); ++k) {
+    const auto count = static_cast<int>(rows_.size());
+    forEachRow(count, pool, [&](int k) {
       findBeside(rows_[k]);
       if (k > 0) findAcross(rows_[k], rows_[k - 1], &Links::down);
-      if (k + 1 < rows_.size()) findAcross(rows_[k], rows_[k + 1], &Links::up);
-    }
-    const auto count = static_cast<std::int32_t>(near_.size());
-    for (std::int32_t i = 0; i < count; ++i) {
-      keepSameSurface(i, &Links::left, &Links::right, true);
-      keepSameSurface(i, &Links::right, &Links::left, true);
-      keepSameSurface(i, &Links::up, &Links::down, false);
-      keepSameSurface(i, &Links::down, &Links::up, false);
-    }
-    for (const int row : rows_) {
+      if (k + 1 < count) findAcross(rows_[k], rows_[k + 1], &Links::up);
+    });
+    // Links depend on the neighbours of both ends, thus on the rows beside, but on no other link
+    // than those of their own row.
+    forEachRow(count, pool, [&](int k) {
+      const int row = rows_[k];
+      const auto end = static_cast<std::int32_t>(image_.row_begin[row + 1]);
+      for (auto i = static_cast<std::int32_t>(image_.row_begin[row]); i < end; ++i) {
+        keepSameSurface(i, &Links::left, &Links::right, true);
+        keepSameSurface(i, &Links::right, &Links::left, true);
+        keepSameSurface(i, &Links::up, &Links::down, false);
+        keepSameSurface(i, &Links::down, &Links::up, false);
+      }
       for (const bool to_left : {true, false}) {
         carryAlong(row, to_left, &Links::up);
         carryAlong(row, to_left, &Links::down);
       }
-    }
+    });
   }
 
   const std::vector<Links>& links() const { return links_; }
@@ -509,7 +531,7 @@ class Linker {
 
 }  // namespace
 
-BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config) {
+BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool) {
   BeamGrid grid;
   if (config.mode == OcclusionMode::kOff) return grid;
   const bool vertical_given = config.vertical_step_deg > 0.0;
@@ -517,26 +539,28 @@ BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config) {
   std::vector<std::uint16_t> rows;
   RangeImage image;
   if (config.mode == OcclusionMode::kAdaptive || !vertical_given || !horizontal_given) {
-    image = rangeImage(cloud, config, &rows);
-    measureSteps(image, config, &grid);
+    image = rangeImage(cloud, config, pool, &rows);
+    measureSteps(image, config, pool, &grid);
   }
   if (vertical_given) grid.vertical_step_rad = radians(config.vertical_step_deg);
   if (horizontal_given) grid.horizontal_step_rad = radians(config.horizontal_step_deg);
   if (config.mode != OcclusionMode::kAdaptive) return grid;
 
   Linker linker(image, config, grid);
-  linker.link();
+  linker.link(pool);
   grid.ring = std::move(rows);
   grid.links.assign(cloud.size(), {kNone, kNone, kNone, kNone});
   const auto indexOf = [&](std::int32_t place) {
     return place == kNone ? kNone : static_cast<std::int32_t>(image.index[place]);
   };
-  for (std::size_t place = 0; place < image.index.size(); ++place) {
-    const BeamGrid::Links& links = linker.links()[place];
-    const std::uint32_t i = image.index[place];
-    grid.links[i] = {indexOf(links.left), indexOf(links.right), indexOf(links.up),
-                     indexOf(links.down)};
-  }
+  forEachRow(image.rows(), pool, [&](int row) {
+    for (std::uint32_t place = image.row_begin[row]; place < image.row_begin[row + 1]; ++place) {
+      const BeamGrid::Links& links = linker.links()[place];
+      const std::uint32_t i = image.index[place];
+      grid.links[i] = {indexOf(links.left), indexOf(links.right), indexOf(links.up),
+                       indexOf(links.down)};
+    }
+  });
   return grid;
 }
 

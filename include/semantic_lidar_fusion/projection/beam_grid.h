@@ -11,6 +11,8 @@
 
 namespace semantic_lidar_fusion {
 
+class ThreadPool;
+
 /// What the lidar's own range image says of each beam; independent of the camera.
 struct BeamGrid {
   struct Ring {
@@ -36,7 +38,8 @@ struct BeamGrid {
 };
 
 /// Steps given in `config` override the data. Throws DataError when the vertical step is needed and
-/// neither the cloud (no ring field) nor `config` gives it.
-BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config);
+/// neither the cloud (no ring field) nor `config` gives it. The rings are shared out among the
+/// threads of `pool`, if there is one; the result does not depend on it.
+BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool = nullptr);
 
 }  // namespace semantic_lidar_fusion
