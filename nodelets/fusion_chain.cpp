@@ -111,12 +111,12 @@ void FusionChain::segment(std::size_t index, SegmentedImage* image) {
   image->semantics.share = image->share;
 }
 
-CompensationResult FusionChain::compensated(const TimedCloud& scan, StampNs reference_ns,
+CompensationResult FusionChain::compensated(TimedCloud scan, StampNs reference_ns,
                                             const PoseBuffer& odometry,
                                             const std::optional<Transform>& T_vehicle_lidar) const {
   // Without extrinsics no pose of the lidar is known: the same as odometry that covers nothing.
   const PoseBuffer unknown;
-  return compensate(scan, reference_ns, T_vehicle_lidar ? odometry : unknown,
+  return compensate(std::move(scan), reference_ns, T_vehicle_lidar ? odometry : unknown,
                     T_vehicle_lidar.value_or(Transform::Identity()), rig_.compensationConfig());
 }
 

@@ -55,8 +55,7 @@ class FusionChain {
 
   /// Equation 5. `T_vehicle_lidar` empty: unknown, so no point has odometry. Motion disabled: the
   /// points as measured.
-  CompensationResult compensated(const TimedCloud& scan, StampNs reference_ns,
-                                 const PoseBuffer& odometry,
+  CompensationResult compensated(TimedCloud scan, StampNs reference_ns, const PoseBuffer& odometry,
                                  const std::optional<Transform>& T_vehicle_lidar) const;
 
   /// The view of camera `camera`: with `image` if there is one and odometry covers its time.

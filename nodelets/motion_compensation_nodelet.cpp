@@ -187,28 +187,29 @@ class MotionCompensationNodelet : public FusionNodelet {
                              std::to_string(rig().odometry.timeout_s) +
                              " s: " + (T_vehicle_lidar ? gap : T_vehicle_lidar.message));
       }
-      const Scan leaving = std::move(pending_.front());
+      Scan leaving = std::move(pending_.front());
       pending_.pop_front();  // first: an error must not meet it again
-      publishCompensated(leaving, t_ref, T_vehicle_lidar);
+      publishCompensated(std::move(leaving.cloud), t_ref, T_vehicle_lidar);
     }
   }
 
-  void publishCompensated(const Scan& scan, StampNs t_ref, const TransformAnswer& T_vehicle_lidar) {
+  void publishCompensated(TimedCloud scan, StampNs t_ref, const TransformAnswer& T_vehicle_lidar) {
+    CompensationResult compensated;
     {
       const StageTimer timer(health(), "compensation");
       // Without extrinsics no pose of the lidar is known: the same as no odometry.
       static const PoseBuffer kNoOdometry;
-      compensate(scan.cloud, t_ref, T_vehicle_lidar ? tf_->source().odometry() : kNoOdometry,
-                 T_vehicle_lidar.transform.value_or(Transform::Identity()),
-                 rig().compensationConfig(), &compensated_);
+      compensated = compensate(
+          std::move(scan), t_ref, T_vehicle_lidar ? tf_->source().odometry() : kNoOdometry,
+          T_vehicle_lidar.transform.value_or(Transform::Identity()), rig().compensationConfig());
     }
-    const CompensationCounters& counters = compensated_.counters;
-    health().count("points", compensated_.cloud.size());
+    const CompensationCounters& counters = compensated.counters;
+    health().count("points", compensated.cloud.size());
     health().count("points without odometry: marked", counters.marked_points);
     health().count("points without odometry: dropped", counters.dropped_points);
     health().count("points without odometry: pose held", counters.held_points);
     health().count("points without odometry: pose extrapolated", counters.extrapolated_points);
-    publish(output_, compensatedCloudMessage(compensated_.cloud));
+    publish(output_, compensatedCloudMessage(compensated.cloud));
   }
 
   std::string explainSilence() override {
@@ -221,7 +222,7 @@ class MotionCompensationNodelet : public FusionNodelet {
   EpochMonitor epoch_;
   StampedStore<Reference> references_{kKnownReferences};
   std::deque<Scan> pending_;
-  CompensationResult compensated_;  // its arrays serve every scan
+  std::size_t max_pending_ = 0;
   StampNs longest_reference_wait_ns_ = 0;
   ros::Publisher output_;
   ros::Subscriber references_subscriber_, lidar_subscriber_;

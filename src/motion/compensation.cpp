@@ -5,7 +5,10 @@
 #include <cmath>
 #include <limits>
 #include <unordered_map>
+#include <utility>
 #include <vector>
+
+#include "motion_kernels.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -16,7 +19,12 @@ constexpr double kSegmentAngle = 1e-3;
 /// Longest duration of a Segment: times within it are 32-bit nanoseconds.
 constexpr StampNs kSegmentNs = kNsPerSecond;
 /// Points that are worked on together.
-constexpr std::size_t kBlock = 256;
+constexpr int kBlock = 256;
+
+const MotionKernels& kernels() {
+  static const MotionKernelList list = usableMotionKernels();
+  return *list.kernels[list.count - 1];
+}
 
 /// T_a_b of two poses in one frame. The difference of the positions comes first, so that nothing is
 /// lost to large coordinates.
@@ -57,9 +65,8 @@ Transform screw(const Transform& step, double fraction) {
 /// are small, so that float holds them; rows of 3x4 matrices.
 struct Segment {
   StampNs begin_ns = 0;
-  StampNs end_ns = 0;          ///< inclusive
-  float start[12] = {};        ///< transform at begin_ns
-  float rate_per_ns[12] = {};  ///< its change
+  StampNs end_ns = 0;        ///< inclusive
+  LinearMotion motion = {};  ///< from begin_ns on
 
   bool contains(StampNs t) const { return begin_ns <= t && t <= end_ns; }
 };
@@ -128,8 +135,8 @@ class Track {
     segment.end_ns = end_ns;
     const double per_ns = end_ns > begin_ns ? 1.0 / static_cast<double>(end_ns - begin_ns) : 0.0;
     for (int i = 0; i < 12; ++i) {
-      segment.start[i] = static_cast<float>(from.data()[i]);
-      segment.rate_per_ns[i] = static_cast<float>((to.data()[i] - from.data()[i]) * per_ns);
+      segment.motion.start[i] = static_cast<float>(from.data()[i]);
+      segment.motion.rate_per_ns[i] = static_cast<float>((to.data()[i] - from.data()[i]) * per_ns);
     }
     segments_.push_back(segment);
   }
@@ -158,15 +165,15 @@ struct Plan {
 };
 
 /// For each firing the time of its packet's first firing.
-std::vector<StampNs> packetTimes(const TimedCloud& scan) {
+std::vector<StampNs> packetTimes(const std::vector<Firing>& firings) {
   std::unordered_map<std::uint32_t, StampNs> first_of_packet;
-  for (const Firing& firing : scan.firings) {
+  for (const Firing& firing : firings) {
     const auto entry = first_of_packet.emplace(firing.packet, firing.begin_ns).first;
     entry->second = std::min(entry->second, firing.begin_ns);
   }
   std::vector<StampNs> times;
-  times.reserve(scan.firings.size());
-  for (const Firing& firing : scan.firings) times.push_back(first_of_packet.at(firing.packet));
+  times.reserve(firings.size());
+  for (const Firing& firing : firings) times.push_back(first_of_packet.at(firing.packet));
   return times;
 }
 
@@ -190,19 +197,19 @@ Fate fateOfUncovered(StampNs begin_ns, StampNs end_ns, const PoseBuffer& odometr
   return Fate::kMark;
 }
 
-Plan makePlan(const TimedCloud& scan, const PoseBuffer& odometry, bool reference_covered,
-              const CompensationConfig& config) {
+Plan makePlan(const std::vector<Firing>& firings, const PoseBuffer& odometry,
+              bool reference_covered, const CompensationConfig& config) {
   Plan plan;
   const bool by_packet = config.granularity == MotionGranularity::kPacket;
-  if (by_packet) plan.packet_times = packetTimes(scan);
-  plan.fates.assign(scan.firings.size(), Fate::kMove);
-  plan.uncovered.assign(scan.firings.size(), false);
+  if (by_packet) plan.packet_times = packetTimes(firings);
+  plan.fates.assign(firings.size(), Fate::kMove);
+  plan.uncovered.assign(firings.size(), false);
   const auto& readings = odometry.readings();
   const StampNs covered_from = readings.empty() ? 1 : readings.front().stamp;
   const StampNs covered_to = readings.empty() ? 0 : readings.back().stamp;
-  for (std::size_t k = 0; k < scan.firings.size(); ++k) {
-    const StampNs begin = by_packet ? plan.packet_times[k] : scan.firings[k].begin_ns;
-    const StampNs end = scan.firings[k].end_ns;
+  for (std::size_t k = 0; k < firings.size(); ++k) {
+    const StampNs begin = by_packet ? plan.packet_times[k] : firings[k].begin_ns;
+    const StampNs end = firings[k].end_ns;
     if (begin < covered_from || end > covered_to) {
       plan.uncovered[k] = true;
       ++plan.uncovered_count;
@@ -296,117 +303,79 @@ Track makeTrack(const PoseBuffer& odometry, const Transform& T_fixed_vehicle_ref
   return track;
 }
 
-/// The arrays are all distinct; the compiler must know it to use vector instructions.
-void transform(const Segment& segment, std::size_t count, const float* __restrict ns,
-               const float* __restrict x, const float* __restrict y, const float* __restrict z,
-               float* __restrict out_x, float* __restrict out_y, float* __restrict out_z) {
-  const auto& a = segment.start;
-  const auto& r = segment.rate_per_ns;
-  for (std::size_t i = 0; i < count; ++i) {
-    out_x[i] = a[0] * x[i] + a[1] * y[i] + a[2] * z[i] + a[3] +
-               ns[i] * (r[0] * x[i] + r[1] * y[i] + r[2] * z[i] + r[3]);
-    out_y[i] = a[4] * x[i] + a[5] * y[i] + a[6] * z[i] + a[7] +
-               ns[i] * (r[4] * x[i] + r[5] * y[i] + r[6] * z[i] + r[7]);
-    out_z[i] = a[8] * x[i] + a[9] * y[i] + a[10] * z[i] + a[11] +
-               ns[i] * (r[8] * x[i] + r[9] * y[i] + r[10] * z[i] + r[11]);
-  }
-}
-
-/// The leading ones of `count` points, at most kBlock, whose times lie in `segment`; `ns` gets
-/// their times since its begin.
-std::size_t timesWithin(const Segment& segment, const StampNs* times, std::size_t count,
-                        float* ns) {
-  const auto length = static_cast<std::uint64_t>(segment.end_ns - segment.begin_ns);
-  // Earlier times wrap to large numbers.
-  const auto since = [&](std::size_t i) {
-    return static_cast<std::uint64_t>(times[i]) - static_cast<std::uint64_t>(segment.begin_ns);
-  };
-  bool all = true;
-  for (std::size_t i = 0; i < count; ++i) {
-    all &= since(i) <= length;
-    ns[i] = static_cast<float>(static_cast<std::int32_t>(since(i)));
-  }
-  if (all) return count;
-  std::size_t within = 0;
-  while (since(within) <= length) ++within;
-  return within;
-}
-
 /// Moves the points from `begin` on, each at its own time, as far as the segment of the first one
-/// reaches; returns how many.
-std::size_t moveByTime(const TimedCloud& scan, std::size_t begin, std::size_t end,
-                       const Segment& segment, Cloud& cloud) {
+/// reaches; returns where it ends.
+std::size_t moveByTime(const std::vector<StampNs>& times, std::size_t begin, std::size_t end,
+                       const Segment& segment, Cloud* cloud) {
+  // A segment longer than kSegmentNs stands still: any of its times will do.
+  const auto length = static_cast<std::uint32_t>(
+      std::min<StampNs>(segment.end_ns - segment.begin_ns, std::numeric_limits<int>::max()));
   float ns[kBlock];
-  std::size_t moved = 0, wanted = 0, within = 0;
+  int wanted = 0, within = 0;
+  std::size_t at = begin;
   do {
-    const std::size_t from = begin + moved;
-    wanted = std::min(kBlock, end - from);
-    within = timesWithin(segment, scan.time_ns.data() + from, wanted, ns);
+    wanted = static_cast<int>(std::min<std::size_t>(kBlock, end - at));
+    within = kernels().timesWithin(&times[at], wanted, segment.begin_ns, length, ns);
     // A point out of its firing's time takes the segment that is nearest.
-    if (moved == 0) within = std::max(within, std::size_t{1});
-    transform(segment, within, ns, scan.x.data() + from, scan.y.data() + from, scan.z.data() + from,
-              cloud.x.data() + from, cloud.y.data() + from, cloud.z.data() + from);
-    moved += within;
-  } while (within == wanted && begin + moved < end);
-  return moved;
+    if (at == begin) within = std::max(within, 1);
+    kernels().move(segment.motion, ns, within, &cloud->x[at], &cloud->y[at], &cloud->z[at]);
+    at += static_cast<std::size_t>(within);
+  } while (within == wanted && at < end);
+  return at;
 }
 
 /// Moves points [begin, end) at one time, in `segment`.
-void moveAt(StampNs time, const TimedCloud& scan, std::size_t begin, std::size_t end,
-            const Segment& segment, Cloud& cloud) {
-  Segment still = segment;
+void moveAt(StampNs time, std::size_t begin, std::size_t end, const Segment& segment,
+            Cloud* cloud) {
+  LinearMotion still = segment.motion;
   const float ns = static_cast<float>(time - segment.begin_ns);
   for (int k = 0; k < 12; ++k) {
     still.start[k] += ns * still.rate_per_ns[k];
     still.rate_per_ns[k] = 0.0f;
   }
   const float zeros[kBlock] = {};
-  for (; begin < end; begin += kBlock) {
-    transform(still, std::min(kBlock, end - begin), zeros, scan.x.data() + begin,
-              scan.y.data() + begin, scan.z.data() + begin, cloud.x.data() + begin,
-              cloud.y.data() + begin, cloud.z.data() + begin);
+  for (std::size_t at = begin; at < end; at += kBlock) {
+    kernels().move(still, zeros, static_cast<int>(std::min<std::size_t>(kBlock, end - at)),
+                   &cloud->x[at], &cloud->y[at], &cloud->z[at]);
   }
 }
 
-void keep(const TimedCloud& scan, std::size_t i, Cloud& cloud) {
-  cloud.x[i] = scan.x[i];
-  cloud.y[i] = scan.y[i];
-  cloud.z[i] = scan.z[i];
-}
-
-void moveAll(const TimedCloud& scan, const Plan& plan, Track& track, Cloud& cloud) {
+void moveAll(const std::vector<StampNs>& times, const std::vector<std::uint32_t>& firing,
+             const Plan& plan, Track* track, Cloud* cloud) {
   const bool by_packet = !plan.packet_times.empty();
   const bool all_move = std::all_of(plan.fates.begin(), plan.fates.end(),
                                     [](Fate fate) { return fate == Fate::kMove; });
   const auto moves = [&](std::size_t i) {
-    return all_move || plan.fates[scan.firing[i]] == Fate::kMove;
+    return all_move || plan.fates[firing[i]] == Fate::kMove;
   };
-  for (std::size_t i = 0; i < scan.size();) {
+  const std::size_t count = times.size();
+  for (std::size_t i = 0; i < count;) {
     if (!moves(i)) {
-      keep(scan, i++, cloud);
+      ++i;
       continue;
     }
     std::size_t end = i + 1;
     if (by_packet) {
-      const StampNs time = plan.packet_times[scan.firing[i]];
-      while (end < scan.size() && plan.packet_times[scan.firing[end]] == time && moves(end)) ++end;
-      moveAt(time, scan, i, end, track.find(time), cloud);
+      const StampNs time = plan.packet_times[firing[i]];
+      while (end < count && plan.packet_times[firing[end]] == time && moves(end)) ++end;
+      moveAt(time, i, end, track->find(time), cloud);
       i = end;
     } else {
-      if (all_move) end = scan.size();
-      while (end < scan.size() && moves(end)) ++end;
-      while (i < end) i += moveByTime(scan, i, end, track.find(scan.time_ns[i]), cloud);
+      if (all_move) end = count;
+      while (end < count && moves(end)) ++end;
+      while (i < end) i = moveByTime(times, i, end, track->find(times[i]), cloud);
     }
   }
 }
 
 /// Sets the status of points that do not move, and counts.
-void markAndCount(const TimedCloud& scan, const Plan& plan, const CompensationConfig& config,
-                  Cloud& cloud, CompensationCounters& counters) {
-  for (std::size_t i = 0; i < scan.size(); ++i) {
-    const std::uint32_t firing = scan.firing[i];
+void markAndCount(const std::vector<std::uint32_t>& firings, const Plan& plan,
+                  const CompensationConfig& config, CompensationResult* result) {
+  CompensationCounters& counters = result->counters;
+  for (std::size_t i = 0; i < firings.size(); ++i) {
+    const std::uint32_t firing = firings[i];
     if (plan.fates[firing] == Fate::kMark) {
-      cloud.status[i] = static_cast<std::uint8_t>(PointStatus::kNoOdometry);
+      result->cloud.status[i] = static_cast<std::uint8_t>(PointStatus::kNoOdometry);
       ++counters.marked_points;
     } else if (plan.fates[firing] == Fate::kDrop) {
       ++counters.dropped_points;
@@ -417,96 +386,81 @@ void markAndCount(const TimedCloud& scan, const Plan& plan, const CompensationCo
   }
 }
 
-void removeDropped(const TimedCloud& scan, const std::vector<Fate>& fates, Cloud& cloud) {
+void removeDropped(const std::vector<std::uint32_t>& firings, const std::vector<Fate>& fates,
+                   Cloud* cloud) {
   std::size_t kept = 0;
-  for (std::size_t i = 0; i < scan.size(); ++i) {
-    if (fates[scan.firing[i]] == Fate::kDrop) continue;
-    cloud.x[kept] = cloud.x[i];
-    cloud.y[kept] = cloud.y[i];
-    cloud.z[kept] = cloud.z[i];
-    cloud.intensity[kept] = cloud.intensity[i];
-    cloud.ring[kept] = cloud.ring[i];
-    cloud.dt[kept] = cloud.dt[i];
-    cloud.status[kept] = cloud.status[i];
+  for (std::size_t i = 0; i < firings.size(); ++i) {
+    if (fates[firings[i]] == Fate::kDrop) continue;
+    cloud->x[kept] = cloud->x[i];
+    cloud->y[kept] = cloud->y[i];
+    cloud->z[kept] = cloud->z[i];
+    cloud->intensity[kept] = cloud->intensity[i];
+    cloud->ring[kept] = cloud->ring[i];
+    cloud->dt[kept] = cloud->dt[i];
+    cloud->status[kept] = cloud->status[i];
     ++kept;
   }
-  cloud.resize(kept);
+  cloud->resize(kept);
 }
 
 /// time - reference in s.
-void secondsSince(StampNs reference_ns, const std::vector<StampNs>& times, const ScanInterval& span,
-                  std::vector<float>& seconds) {
-  seconds.resize(times.size());
+std::vector<float> secondsSince(StampNs reference_ns, const std::vector<StampNs>& times,
+                                const ScanInterval& span) {
+  std::vector<float> seconds(times.size());
   constexpr StampNs kNear = std::numeric_limits<std::int32_t>::max();
   if (span.first_ns >= reference_ns - kNear && span.last_ns <= reference_ns + kNear) {
-    // 32-bit integers convert by vector instructions.
-    for (std::size_t i = 0; i < times.size(); ++i) {
-      seconds[i] = static_cast<float>(1e-9 * static_cast<std::int32_t>(times[i] - reference_ns));
-    }
+    kernels().secondsSince(reference_ns, times.data(), static_cast<int>(times.size()),
+                           seconds.data());
   } else {
     for (std::size_t i = 0; i < times.size(); ++i) {
       seconds[i] = static_cast<float>(toSeconds(times[i] - reference_ns));
     }
   }
+  return seconds;
 }
 
-/// Everything but the coordinates and what odometry does to the status.
-void describe(const TimedCloud& scan, StampNs reference_ns, Cloud& cloud) {
-  const ScanInterval span = scanInterval(scan);
-  cloud.frame_id = scan.frame_id;
-  cloud.stamp = scan.empty() ? scan.header_stamp : reference_ns;
+/// The scan as a rigid cloud whose points do not move; takes over its arrays.
+Cloud asMeasured(TimedCloud* scan, StampNs reference_ns) {
+  ScanInterval span{scan->header_stamp, scan->header_stamp};
+  if (!scan->empty()) {
+    kernels().span(scan->time_ns.data(), static_cast<int>(scan->size()), &span.first_ns,
+                   &span.last_ns);
+  }
+  Cloud cloud;
+  cloud.frame_id = scan->frame_id;
+  cloud.stamp = scan->empty() ? scan->header_stamp : reference_ns;
   cloud.first_point_ns = span.first_ns;
-  cloud.x.resize(scan.size());
-  cloud.y.resize(scan.size());
-  cloud.z.resize(scan.size());
-  cloud.intensity = scan.intensity;
-  cloud.ring = scan.ring;
-  cloud.status.assign(scan.size(), static_cast<std::uint8_t>(PointStatus::kFused));
-  secondsSince(reference_ns, scan.time_ns, span, cloud.dt);
-}
-
-void keepAll(const TimedCloud& scan, Cloud& cloud) {
-  cloud.x = scan.x;
-  cloud.y = scan.y;
-  cloud.z = scan.z;
+  cloud.dt = secondsSince(reference_ns, scan->time_ns, span);
+  cloud.status.assign(scan->size(), static_cast<std::uint8_t>(PointStatus::kFused));
+  cloud.x = std::move(scan->x);
+  cloud.y = std::move(scan->y);
+  cloud.z = std::move(scan->z);
+  cloud.intensity = std::move(scan->intensity);
+  cloud.ring = std::move(scan->ring);
+  return cloud;
 }
 
 }  // namespace
 
-void compensate(const TimedCloud& scan, StampNs reference_ns, const PoseBuffer& odometry,
-                const Transform& T_vehicle_lidar, const CompensationConfig& config,
-                CompensationResult* result) {
-  Cloud& cloud = result->cloud;
-  CompensationCounters& counters = result->counters;
-  counters = {};
-  describe(scan, reference_ns, cloud);
-  if (!config.enabled || scan.empty()) {
-    keepAll(scan, cloud);
-    return;
-  }
+CompensationResult compensate(TimedCloud scan, StampNs reference_ns, const PoseBuffer& odometry,
+                              const Transform& T_vehicle_lidar, const CompensationConfig& config) {
+  CompensationResult result;
+  result.cloud = asMeasured(&scan, reference_ns);
+  if (!config.enabled || result.cloud.empty()) return result;
 
   const std::optional<Transform> T_fixed_vehicle_ref = odometry.lookup(reference_ns);
-  counters.reference_covered = T_fixed_vehicle_ref.has_value();
+  result.counters.reference_covered = T_fixed_vehicle_ref.has_value();
 
-  const Plan plan = makePlan(scan, odometry, counters.reference_covered, config);
-  counters.uncovered_firings = plan.uncovered_count;
+  const Plan plan = makePlan(scan.firings, odometry, result.counters.reference_covered, config);
+  result.counters.uncovered_firings = plan.uncovered_count;
   if (plan.first_ns <= plan.last_ns) {
     Track track = makeTrack(odometry, *T_fixed_vehicle_ref, T_vehicle_lidar, config, plan);
-    moveAll(scan, plan, track, cloud);
-  } else {
-    keepAll(scan, cloud);
+    moveAll(scan.time_ns, scan.firing, plan, &track, &result.cloud);
   }
-  if (plan.uncovered_count > 0 || !counters.reference_covered) {
-    markAndCount(scan, plan, config, cloud, counters);
-    if (counters.dropped_points > 0) removeDropped(scan, plan.fates, cloud);
+  if (plan.uncovered_count > 0 || !result.counters.reference_covered) {
+    markAndCount(scan.firing, plan, config, &result);
+    if (result.counters.dropped_points > 0) removeDropped(scan.firing, plan.fates, &result.cloud);
   }
-}
-
-CompensationResult compensate(const TimedCloud& scan, StampNs reference_ns,
-                              const PoseBuffer& odometry, const Transform& T_vehicle_lidar,
-                              const CompensationConfig& config) {
-  CompensationResult result;
-  compensate(scan, reference_ns, odometry, T_vehicle_lidar, config, &result);
   return result;
 }
 

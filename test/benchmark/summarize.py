@@ -49,7 +49,8 @@ PAIRS = [
         None,
         None,
     ),
-    ("motion", r"motion.*/ours.*", r"motion.*/(pcl|peer|tf2).*", "pcl_ros + tf2 per packet", 8, 11),
+    ("motion", r"motion/ours", r"motion/tf2.*", "pcl_ros + tf2 per packet", 8, 11),
+    ("motion", r"motion/ours", r"motion_by_firing/tf2.*", "pcl_ros + tf2 per firing", None, None),
     (
         "projection",
         r"projection/ours.*",

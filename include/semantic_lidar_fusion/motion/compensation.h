@@ -54,15 +54,10 @@ struct CompensationResult {
   CompensationCounters counters;
 };
 
-/// All points of `scan` as seen from the lidar's pose at `reference_ns` (true time). The order of
-/// points is kept. The arrays of `result` keep their memory from scan to scan: most of the time of
-/// a new result goes into that.
-void compensate(const TimedCloud& scan, StampNs reference_ns, const PoseBuffer& odometry,
-                const Transform& T_vehicle_lidar, const CompensationConfig& config,
-                CompensationResult* result);
-CompensationResult compensate(const TimedCloud& scan, StampNs reference_ns,
-                              const PoseBuffer& odometry, const Transform& T_vehicle_lidar,
-                              const CompensationConfig& config);
+/// All points of `scan` as seen from the lidar's pose at `reference_ns` (true time), in the same
+/// order. The result takes over the scan's arrays: move the scan in unless it is still wanted.
+CompensationResult compensate(TimedCloud scan, StampNs reference_ns, const PoseBuffer& odometry,
+                              const Transform& T_vehicle_lidar, const CompensationConfig& config);
 
 /// Vehicle motion between two times, T_vehicle(to)_vehicle(from); empty if odometry does not cover
 /// both.

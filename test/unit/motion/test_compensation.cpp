@@ -379,34 +379,6 @@ TEST_F(PartlyCovered, WithoutThePoseAtTheReferenceNoneIsDropped) {
   EXPECT_EQ(result.cloud.status, std::vector<std::uint8_t>(drive.scan.size(), 4));
 }
 
-/// Whatever the result held before: more points, other states.
-TEST_F(PartlyCovered, AResultThatIsUsedAgainIsAsANewOne) {
-  CompensationResult used;
-  for (const OnMissingOdometry rule :
-       {OnMissingOdometry::kMark, OnMissingOdometry::kDrop, OnMissingOdometry::kHold,
-        OnMissingOdometry::kExtrapolate, OnMissingOdometry::kMark}) {
-    for (const bool enabled : {true, false}) {
-      CompensationConfig config;
-      config.enabled = enabled;
-      config.on_missing = rule;
-      const CompensationResult fresh =
-          compensate(drive.scan, drive.reference, odometry, lidarOnVehicle(), config);
-      compensate(drive.scan, drive.reference, odometry, lidarOnVehicle(), config, &used);
-      EXPECT_EQ(used.cloud.x, fresh.cloud.x);
-      EXPECT_EQ(used.cloud.y, fresh.cloud.y);
-      EXPECT_EQ(used.cloud.z, fresh.cloud.z);
-      EXPECT_EQ(used.cloud.intensity, fresh.cloud.intensity);
-      EXPECT_EQ(used.cloud.ring, fresh.cloud.ring);
-      EXPECT_EQ(used.cloud.dt, fresh.cloud.dt);
-      EXPECT_EQ(used.cloud.status, fresh.cloud.status);
-      EXPECT_EQ(used.counters.marked_points, fresh.counters.marked_points);
-      EXPECT_EQ(used.counters.dropped_points, fresh.counters.dropped_points);
-      EXPECT_EQ(used.counters.held_points, fresh.counters.held_points);
-      EXPECT_EQ(used.counters.extrapolated_points, fresh.counters.extrapolated_points);
-    }
-  }
-}
-
 TEST_F(PartlyCovered, HoldTakesTheNearestReading) {
   const CompensationResult result = run(OnMissingOdometry::kHold);
   EXPECT_EQ(result.counters.held_points, uncoveredPoints());
