@@ -76,18 +76,21 @@ void FusionNodelet::stop() {
   gate_->close();
 }
 
-void FusionNodelet::keepQueues() {
+void FusionNodelet::takeQueues() {
   ros::CallbackQueueInterface* const queues[] = {getNodeHandle().getCallbackQueue(),
                                                  getMTNodeHandle().getCallbackQueue()};
   for (int i = 0; i < 2; ++i) {
     if (auto* queue = dynamic_cast<nodelet::detail::CallbackQueue*>(queues[i])) {
       kept_queues_[i] = std::shared_ptr<void>(nullptr, [q = queue->shared_from_this()](void*) {});
+      // nodelet 1.10.0 has them disabled until onInit ends, and forgets callbacks of that time: a
+      // latched message never arrives then, and a timer that was due is dead for good.
+      queue->enable();
     }
   }
 }
 
 void FusionNodelet::onInit() {
-  keepQueues();
+  takeQueues();
   try {
     for (const std::string& problem : unknownParameters(getPrivateNodeHandle())) {
       NODELET_WARN_STREAM(problem);

@@ -166,7 +166,7 @@ class FusionNodelet : public nodelet::Nodelet {
   /// How far the simulated clock has run, jumps apart, and how long it has stood still, both in ns.
   std::pair<StampNs, StampNs> simulatedClock() const;
   void reportOverflow(const std::string& topic);
-  void keepQueues();
+  void takeQueues();
   /// Tells, latched, which version runs with which rig.
   void publishConfiguration();
 
