@@ -77,9 +77,13 @@ def wait_until(condition, what, timeout=30.0):
 
 
 def _stop(process, timeout=20.0):
-    """Ends a process that was started here, as Ctrl-C does."""
+    """Ends a process that was started here, as Ctrl-C does: with its children, if it leads a
+    session of its own."""
     if process.poll() is None:
-        process.send_signal(signal.SIGINT)
+        if os.getpgid(process.pid) == process.pid:
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            process.send_signal(signal.SIGINT)
         try:
             process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -246,6 +250,7 @@ def played(bag, *options):
         command + list(options) + [bag, "__name:=player"],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
+        start_new_session=True,  # `rosbag` of Debian 11 leaves its player alone when interrupted
     )
     try:
         yield process
