@@ -24,8 +24,7 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr std::size_t kMaxPendingScans = 4;
-constexpr std::size_t kKnownReferences = 32;
+constexpr std::size_t kKnownReferences = 128;
 constexpr StampNs kReferenceGraceNs = 500000000;
 
 }  // namespace
@@ -54,6 +53,7 @@ class MotionCompensationNodelet : public FusionNodelet {
         });
     // The selection nodelet settles t_ref within its own timeout; the rest is grace for its thread.
     longest_reference_wait_ns_ = toNs(rig().reference.timeout_s) + kReferenceGraceNs;
+    max_pending_ = scansThatWait(longest_reference_wait_ns_ + toNs(rig().odometry.timeout_s));
     tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
     output_ = advertise<sensor_msgs::PointCloud2>(getNodeHandle(), "points_compensated", 4);
     startTicking();
@@ -93,10 +93,10 @@ class MotionCompensationNodelet : public FusionNodelet {
     }
     if (!current("lidar", scan.interval.first_ns)) return;
     pending_.push_back(std::move(scan));
-    if (pending_.size() > kMaxPendingScans) {
+    if (pending_.size() > max_pending_) {
       pending_.pop_front();
       health().count("dropped: scan, too many wait for odometry or scan_reference");
-      warn("pending", "a scan is dropped: " + std::to_string(kMaxPendingScans) +
+      warn("pending", "a scan is dropped: " + std::to_string(max_pending_) +
                           " others wait for odometry or scan_reference");
     }
     release();

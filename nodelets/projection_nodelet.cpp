@@ -58,8 +58,12 @@ class ProjectionNodelet : public FusionNodelet {
     chain_ = std::make_unique<FusionChain>(rig(), /*with_network=*/false);
 
     FusionQueueConfig queue;
-    for (const CameraConfig& camera : rig().cameras)
+    StampNs longest_wait_ns = 0;
+    for (const CameraConfig& camera : rig().cameras) {
       queue.timeout_ns.push_back(toNs(camera.timeout_s));
+      longest_wait_ns = std::max(longest_wait_ns, queue.timeout_ns.back());
+    }
+    queue.max_pending = scansThatWait(longest_wait_ns);
     queue_ = std::make_unique<FusionQueue>(queue);
     tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
 

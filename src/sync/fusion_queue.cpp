@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: MIT
 #include "semantic_lidar_fusion/sync/fusion_queue.h"
 
+#include <algorithm>
 #include <utility>
 
 namespace semantic_lidar_fusion {
 namespace {
 
-/// Decisions remembered; scans whose cloud never comes fall out at the old end.
+/// Decisions remembered at least; scans whose cloud never comes fall out at the old end.
 constexpr std::size_t kKnownDecisions = 32;
 /// A cloud's first point is told by a float `dt` relative to t_ref: off by some nanoseconds.
 constexpr StampNs kKeyToleranceNs = 1000;
@@ -15,7 +16,7 @@ constexpr StampNs kKeyToleranceNs = 1000;
 
 FusionQueue::FusionQueue(FusionQueueConfig config)
     : config_(std::move(config)),
-      decisions_(kKnownDecisions),
+      decisions_(std::max(kKnownDecisions, 2 * config_.max_pending)),
       semantics_(config_.timeout_ns.size(), StampedStore<bool>(config_.known_images)) {}
 
 FusionQueue::Decision& FusionQueue::decision(StampNs key_ns) {

@@ -52,9 +52,8 @@ class Waiting(Feed):
         "odometry": 1,
         "reference": 2,
     }
-    # Slower than life, so that only what is withheld is late on a busy machine; the four scans that
-    # may wait at a time are longer than the timeouts.
-    pace = 4.0
+    # Slower than life, so that only what is withheld is late on a busy machine.
+    pace = 2.0
 
     def absent(self, topic, message):
         return None if topic.startswith("/right/") and not topic.endswith("info") else message
