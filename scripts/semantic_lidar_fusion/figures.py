@@ -636,11 +636,21 @@ def draw_top_views(path: str, scene: Scene) -> None:
 
 
 def _scale_bar(axis: Any) -> None:
-    """10 m in the upper left corner."""
+    """10 m in the upper left corner, readable over points too."""
     (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
-    x, y = left + 0.05 * (right - left), bottom + 0.86 * (top - bottom)
-    axis.plot([x, x + 10], [y, y], color="black", linewidth=1.2)
-    axis.text(x + 5, y + 0.03 * (top - bottom), "10 m", ha="center", va="bottom", fontsize=7)
+    x, y = left + 0.05 * (right - left), bottom + 0.84 * (top - bottom)
+    paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1}
+    axis.plot([x, x + 10], [y, y], color="black", linewidth=1.2, zorder=4)
+    axis.text(
+        x + 5,
+        y + 0.04 * (top - bottom),
+        "10 m",
+        ha="center",
+        va="bottom",
+        fontsize=7,
+        bbox=paper,
+        zorder=5,
+    )
 
 
 def make(scene: Scene, folder: str, chosen: Tuple[str, ...], camera: Optional[str]) -> List[str]:
