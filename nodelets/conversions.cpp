@@ -13,6 +13,7 @@
 #include <opencv2/imgcodecs.hpp>
 #include <opencv2/imgproc.hpp>
 
+#include "jpeg_decoder.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {
@@ -295,7 +296,8 @@ cv::Mat colorImage(const sensor_msgs::ImageConstPtr& message) {
 
 cv::Mat decodedImage(const sensor_msgs::CompressedImage& message) {
   if (message.data.empty()) throw DataError("compressed image is empty");
-  cv::Mat image;
+  cv::Mat image = decodedJpeg(message.data);
+  if (!image.empty()) return image;
   try {
     image = cv::imdecode(message.data, cv::IMREAD_UNCHANGED);
   } catch (const cv::Exception& e) {

@@ -40,8 +40,9 @@ noetic_ros="ros-noetic-catkin ros-noetic-roscpp ros-noetic-nodelet ros-noetic-pl
 common="build-essential cmake libeigen3-dev libopencv-dev libyaml-cpp-dev libgtest-dev
   python3-matplotlib python3-numpy python3-opencv python3-pytest python3-scipy python3-setuptools
   python3-tqdm python3-yaml"
-# Each of these only adds something: the simulator, the map's bindings, export and clusters, ...
-optional="libembree-dev liboctomap-dev pybind11-dev python3-dev python3-dask python3-distributed"
+# Each of these only adds something: fast JPEG, the simulator, the map's bindings, export and
+# clusters, ...
+optional="libturbojpeg0-dev libembree-dev liboctomap-dev pybind11-dev python3-dev python3-dask python3-distributed"
 if [ -d /opt/ros/noetic ]; then
   optional="$optional ros-noetic-map-msgs"
 else

@@ -8,6 +8,7 @@
 #include <cstring>
 #include <limits>
 #include <opencv2/imgcodecs.hpp>
+#include <opencv2/imgproc.hpp>
 #include <random>
 
 #include "conversions.h"
@@ -223,6 +224,51 @@ TEST(DecodedImage, ReadsPngAndJpeg) {
   cv::imencode(".png", deep, message.data);
   ASSERT_EQ(decodedImage(message).type(), CV_8UC1);
   EXPECT_EQ(decodedImage(message).at<std::uint8_t>(0, 0), 255);
+}
+
+/// cv::imdecode is the oracle; libraries of different versions may round differently.
+TEST(DecodedImage, ReadsJpegAsOpencvDoes) {
+  cv::RNG random(4);
+  for (const cv::Size size :
+       {cv::Size(1, 1), cv::Size(7, 5), cv::Size(33, 17), cv::Size(320, 201)}) {
+    for (const int channels : {1, 3}) {
+      cv::Mat picture(size, CV_8UC(channels));
+      random.fill(picture, cv::RNG::UNIFORM, 0, 256);
+      cv::GaussianBlur(picture, picture, cv::Size(5, 5), 2.0);
+      for (const int quality : {20, 95}) {
+        for (const int progressive : {0, 1}) {
+          sensor_msgs::CompressedImage message;
+          cv::imencode(".jpg", picture, message.data,
+                       {cv::IMWRITE_JPEG_QUALITY, quality, cv::IMWRITE_JPEG_PROGRESSIVE,
+                        progressive, cv::IMWRITE_JPEG_RST_INTERVAL, progressive});
+          const cv::Mat expected = cv::imdecode(message.data, cv::IMREAD_UNCHANGED);
+          const cv::Mat decoded = decodedImage(message);
+          ASSERT_EQ(decoded.type(), expected.type());
+          ASSERT_EQ(decoded.size(), expected.size());
+          EXPECT_LE(cv::norm(decoded, expected, cv::NORM_INF), 1.0)
+              << size << ", " << channels << " channels, quality " << quality;
+        }
+      }
+    }
+  }
+}
+
+/// Whatever is not a whole JPEG goes the way of other formats, and ends as it does there.
+TEST(DecodedImage, DamagedJpegIsOpencvsToJudge) {
+  cv::Mat picture(64, 48, CV_8UC3);
+  cv::RNG(5).fill(picture, cv::RNG::UNIFORM, 0, 256);
+  sensor_msgs::CompressedImage whole;
+  cv::imencode(".jpg", picture, whole.data);
+  for (std::size_t length = 1; length < whole.data.size(); length += 37) {
+    sensor_msgs::CompressedImage cut = whole;
+    cut.data.resize(length);
+    const cv::Mat expected = cv::imdecode(cut.data, cv::IMREAD_UNCHANGED);
+    if (expected.empty()) {
+      EXPECT_THROW(decodedImage(cut), DataError) << length;
+    } else {
+      EXPECT_EQ(cv::norm(decodedImage(cut), expected, cv::NORM_INF), 0.0) << length;
+    }
+  }
 }
 
 TEST(DecodedImage, RefusesGarbageAndTruncation) {

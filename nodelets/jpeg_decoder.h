@@ -1,0 +1,16 @@
+// SPDX-License-Identifier: MIT
+#pragma once
+
+#include <cstdint>
+#include <opencv2/core.hpp>
+#include <vector>
+
+namespace semantic_lidar_fusion {
+
+/// The pixels of a JPEG image as cv::imdecode gives them, CV_8UC1 or CV_8UC3 in BGR order, without
+/// its detour over RGB, which takes a quarter of the time of compressed streams. Empty if the data
+/// is something else, unusual or damaged in any way, or if the package is built without
+/// libjpeg-turbo: then cv::imdecode is to judge.
+cv::Mat decodedJpeg(const std::vector<std::uint8_t>& data);
+
+}  // namespace semantic_lidar_fusion
