@@ -42,7 +42,8 @@ common="build-essential cmake libeigen3-dev libopencv-dev libyaml-cpp-dev libgte
   python3-tqdm python3-yaml"
 # Each of these only adds something: fast JPEG, the simulator, the map's bindings, export and
 # clusters, ...
-optional="libturbojpeg0-dev libembree-dev liboctomap-dev pybind11-dev python3-dev python3-dask python3-distributed"
+optional="libturbojpeg0-dev libembree-dev liboctomap-dev pybind11-dev python3-dev python3-dask
+  python3-distributed"
 if [ -d /opt/ros/noetic ]; then
   optional="$optional ros-noetic-map-msgs"
 else
