@@ -5,8 +5,9 @@
 #   test/fuzz/run.sh [EXECUTIONS] [BUILD_DIR] [NAME...]
 #
 # EXECUTIONS of each (default 1000000), BUILD_DIR (default build-fuzzer of the package; it keeps the
-# corpora, so that a later run goes on), only the fuzzers named. Exit code 77: no clang with
-# libFuzzer here. A finding is left as BUILD_DIR/findings/*, and fails.
+# corpora, so that a later run goes on), only the fuzzers named, inputs of at most SLF_FUZZ_LENGTH
+# bytes (default 5000). Exit code 77: no clang with libFuzzer here. A finding is left as
+# BUILD_DIR/findings/*, and fails.
 set -euo pipefail
 PATH=/usr/sbin:/usr/bin:/sbin:/bin
 source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
@@ -40,7 +41,7 @@ fuzz() {
   local corpus=$build_dir/corpus/$name log=$build_dir/$name.log
   mkdir -p "$corpus"
   SLF_FUZZ_SEEDS=$corpus "$program" >/dev/null
-  if ! "$program" -runs="$executions" -seed=1 -max_len=5000 -timeout=20 -rss_limit_mb=2048 \
+  if ! "$program" -runs="$executions" -seed=1 -max_len="${SLF_FUZZ_LENGTH:-5000}" -timeout=20 -rss_limit_mb=2048 \
     -artifact_prefix="$build_dir/findings/$name-" "$corpus" >"$log" 2>&1; then
     tail -60 "$log"
     echo "fuzz_$name: a finding, see $log"
