@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <optional>
 #include <string>
 #include <utility>
 
@@ -146,8 +147,7 @@ class PixelDistribution {
         class_count_(class_count),
         lazy_(semantics.probabilities.empty()),
         to_superpixel_(image, superpixelSize()),
-        to_score_(lazy_ ? image : ImageSize{}, superpixelSize(), semantics.scores.size()),
-        scores_(static_cast<std::size_t>(class_count)) {}
+        to_score_(lazy_ ? image : ImageSize{}, superpixelSize(), semantics.scores.size()) {}
 
   /// Asks the memory for what `read` will need.
   void prefetch(int column, int row) const {
@@ -162,7 +162,8 @@ class PixelDistribution {
   }
 
   /// Writes class_count values that sum to 1; false if they are uniform for want of valid input.
-  bool read(int column, int row, double* out) {
+  /// `scratch` has room for class_count values.
+  bool read(int column, int row, float* scratch, double* out) const {
     const int q_column = to_superpixel_.column(column), q_row = to_superpixel_.row(row);
     if (!lazy_) return readProbabilities(q_column, q_row, out);
     const int score_column = to_score_.column(column), score_row = to_score_.row(row);
@@ -170,8 +171,8 @@ class PixelDistribution {
     if (scores != nullptr) {
       scores += static_cast<std::ptrdiff_t>(score_column) * class_count_;
     } else {
-      semantics_.scores.read(score_column, score_row, scores_.data());
-      scores = scores_.data();
+      semantics_.scores.read(score_column, score_row, scratch);
+      scores = scratch;
     }
     const double share = semantics_.share.at<float>(q_row, q_column);
     return temperedSoftmax(scores, class_count_, share, config_, out);
@@ -213,7 +214,6 @@ class PixelDistribution {
   bool lazy_;
   GridTable to_superpixel_;
   GridTable to_score_;  ///< from image pixels, through superpixel pixels
-  std::vector<float> scores_;
 };
 
 /// Order of precedence among cameras: fused, occluded, no image, outside.
@@ -236,17 +236,24 @@ void improve(PointStatus status, std::uint8_t* of_point) {
   }
 }
 
+struct Pixel {
+  int column, row;
+};
+
 /// What one camera says of a scan.
 struct CameraOutcome {
-  CameraVotes votes;                     ///< of visible points
+  CameraVotes votes;          ///< of visible points
+  std::vector<Pixel> pixels;  ///< of the votes
+  std::optional<PixelDistribution> distribution;
   std::vector<std::uint32_t> hidden;     ///< points that a nearer one hides
   std::vector<std::uint32_t> would_see;  ///< points in view of a camera without an image
   CameraFusionReport report;
 };
 
-/// Projection, occlusion, ego mask and transfer in one camera that has an image.
-void vote(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
-          const BeamGrid& grid, bool with_pixels, CameraOutcome* outcome) {
+/// Projection, occlusion and ego mask in one camera that has an image: who votes, and with which
+/// pixel. The probabilities are still to be read.
+void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
+         const BeamGrid& grid, bool with_pixels, CameraOutcome* outcome) {
   const CameraModel& model = *view.model;
   const ImageSize& size = model.imageSize();
   const double margin_px = castMarginPx(model, grid, config.occlusion);
@@ -255,14 +262,9 @@ void vote(const Cloud& cloud, const CameraView& view, const FusionConfig& config
       visiblePoints(cloud, points, view.T_camera_lidar, model, grid, config.occlusion);
 
   const EgoMask mask(view.ego_mask, size);
-  PixelDistribution distribution(view.semantics, size, config.uncertainty, config.class_count);
-  struct Pixel {
-    int column, row;
-  };
-  std::vector<Pixel> pixels;  // of the votes
   CameraVotes& votes = outcome->votes;
   CameraFusionReport& report = outcome->report;
-  pixels.reserve(points.size());
+  outcome->pixels.reserve(points.size());
   votes.index.reserve(points.size());
   votes.theta.reserve(points.size());
   votes.rig_index = view.rig_index;
@@ -279,7 +281,7 @@ void vote(const Cloud& cloud, const CameraView& view, const FusionConfig& config
       report.status.push_back(status);
     }
     if (status == PointStatus::kFused) {
-      pixels.push_back({column, row});
+      outcome->pixels.push_back({column, row});
       votes.index.push_back(points.index[k]);
       votes.theta.push_back(points.theta[k]);
     } else if (status == PointStatus::kOccluded) {
@@ -292,20 +294,47 @@ void vote(const Cloud& cloud, const CameraView& view, const FusionConfig& config
       votes.time_difference_ns.push_back(std::abs(cloud.stamp + toNs(cloud.dt[i]) - view.image_ns));
     }
   }
+  outcome->distribution.emplace(view.semantics, size, config.uncertainty, config.class_count);
+  votes.probabilities.resize(outcome->pixels.size() * static_cast<std::size_t>(config.class_count));
+}
 
+/// Votes [begin, end) of a camera.
+struct Share {
+  std::size_t camera, begin, end;
+  std::size_t nonfinite = 0;
+};
+
+/// Even shares of all cameras' votes: cameras alone are too few to divide among threads.
+std::vector<Share> sharesOf(const std::vector<CameraOutcome>& outcomes) {
+  constexpr std::size_t kShare = 1024;
+  std::vector<Share> shares;
+  for (std::size_t camera = 0; camera < outcomes.size(); ++camera) {
+    const std::size_t votes = outcomes[camera].pixels.size();
+    for (std::size_t begin = 0; begin < votes; begin += kShare) {
+      shares.push_back({camera, begin, std::min(votes, begin + kShare)});
+    }
+  }
+  return shares;
+}
+
+/// Reads the probabilities of a share of a camera's votes.
+void transfer(int class_count, CameraOutcome* outcome, Share* share) {
   constexpr std::size_t kAhead = 16;  // enough to hide a trip to the memory
-  const std::size_t classes = static_cast<std::size_t>(config.class_count);
-  votes.probabilities.reserve(pixels.size() * classes);
-  std::vector<double> p(classes);
-  for (std::size_t k = 0; k < std::min(kAhead, pixels.size()); ++k) {
+  const auto classes = static_cast<std::size_t>(class_count);
+  const PixelDistribution& distribution = *outcome->distribution;
+  const std::vector<Pixel>& pixels = outcome->pixels;
+  std::vector<float> scratch(classes);
+  for (std::size_t k = share->begin; k < std::min(share->begin + kAhead, share->end); ++k) {
     distribution.prefetch(pixels[k].column, pixels[k].row);
   }
-  for (std::size_t k = 0; k < pixels.size(); ++k) {
-    if (k + kAhead < pixels.size()) {
+  for (std::size_t k = share->begin; k < share->end; ++k) {
+    if (k + kAhead < share->end) {
       distribution.prefetch(pixels[k + kAhead].column, pixels[k + kAhead].row);
     }
-    if (!distribution.read(pixels[k].column, pixels[k].row, p.data())) ++report.nonfinite;
-    votes.probabilities.insert(votes.probabilities.end(), p.begin(), p.end());
+    double* const out = &outcome->votes.probabilities[k * classes];
+    if (!distribution.read(pixels[k].column, pixels[k].row, scratch.data(), out)) {
+      ++share->nonfinite;
+    }
   }
 }
 
@@ -394,11 +423,18 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
     CameraOutcome& outcome = outcomes[static_cast<std::size_t>(camera)];
     if (!view.model || cloud.empty()) return;
     if (view.has_image) {
-      vote(cloud, view, config_, grid, with_pixels, &outcome);
+      see(cloud, view, config_, grid, with_pixels, &outcome);
     } else {
       outcome.would_see = pointsWithoutImage(cloud, view);
     }
   });
+
+  std::vector<Share> shares = sharesOf(outcomes);
+  pool_->forEach(static_cast<int>(shares.size()), [&](int k) {
+    Share& share = shares[static_cast<std::size_t>(k)];
+    transfer(config_.class_count, &outcomes[share.camera], &share);
+  });
+  for (const Share& share : shares) outcomes[share.camera].report.nonfinite += share.nonfinite;
 
   std::vector<CameraVotes> votes;
   votes.reserve(views.size());
