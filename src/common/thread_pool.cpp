@@ -75,4 +75,12 @@ void ThreadPool::takeItems(std::unique_lock<std::mutex>* lock) {
   }
 }
 
+void forEach(ThreadPool* pool, int count, const std::function<void(int)>& work) {
+  if (pool != nullptr) {
+    pool->forEach(count, work);
+    return;
+  }
+  for (int item = 0; item < count; ++item) work(item);
+}
+
 }  // namespace semantic_lidar_fusion

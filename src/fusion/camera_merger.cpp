@@ -173,11 +173,7 @@ void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, Semanti
   cloud->probabilities.assign(points * static_cast<std::size_t>(cloud->class_count), 0.0f);
 
   constexpr std::size_t kShare = 4096;
-  if (pool == nullptr || points <= kShare) {
-    mergeRange(votes, rule, 0, points, cloud);
-    return;
-  }
-  pool->forEach(static_cast<int>((points + kShare - 1) / kShare), [&](int share) {
+  forEach(pool, static_cast<int>((points + kShare - 1) / kShare), [&](int share) {
     const std::size_t begin = kShare * static_cast<std::size_t>(share);
     mergeRange(votes, rule, begin, std::min(points, begin + kShare), cloud);
   });

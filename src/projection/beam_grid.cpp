@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <functional>
 #include <limits>
 #include <numeric>
 
@@ -67,15 +66,6 @@ float quickAtan2(float y, float x) {
   r = ay > ax ? 0.25f * kTwoPi - r : r;
   r = x < 0.0f ? 0.5f * kTwoPi - r : r;
   return y < 0.0f ? -r : r;
-}
-
-/// Calls work(0), ..., work(rows - 1), on the threads of `pool` if there is one.
-void forEachRow(int rows, ThreadPool* pool, const std::function<void(int)>& work) {
-  if (pool != nullptr) {
-    pool->forEach(rows, work);
-    return;
-  }
-  for (int row = 0; row < rows; ++row) work(row);
 }
 
 /// A cloud as rows of returns sorted by azimuth. A return's *place* is its index in these arrays.
@@ -187,7 +177,7 @@ RangeImage rangeImage(const Cloud& cloud, const OcclusionConfig& config, ThreadP
     values->resize(keys.size());
   }
   image.index.resize(keys.size());
-  forEachRow(row_count, pool, [&](int row) {
+  forEach(pool, row_count, [&](int row) {
     sortRow(keys.data() + image.row_begin[row], image.count(row));
     for (std::uint32_t place = image.row_begin[row]; place < image.row_begin[row + 1]; ++place) {
       const std::uint32_t i = keys[place].index;
@@ -244,7 +234,7 @@ void measureSteps(const RangeImage& image, const OcclusionConfig& config, Thread
   const auto rows = static_cast<std::size_t>(image.rows());
   grid->rings.assign(rows, {});
   std::vector<std::vector<float>> few(rows);  // the steps of rows that are too short for a median
-  forEachRow(image.rows(), pool, [&](int row) {
+  forEach(pool, image.rows(), [&](int row) {
     const std::uint32_t begin = image.row_begin[row], end = image.row_begin[row + 1];
     if (begin == end) return;
     std::vector<float> values;
@@ -329,14 +319,14 @@ class Linker {
       return grid_.rings[a].elevation_rad < grid_.rings[b].elevation_rad;
     });
     const auto count = static_cast<int>(rows_.size());
-    forEachRow(count, pool, [&](int k) {
+    forEach(pool, count, [&](int k) {
       findBeside(rows_[k]);
       if (k > 0) findAcross(rows_[k], rows_[k - 1], &Links::down);
       if (k + 1 < count) findAcross(rows_[k], rows_[k + 1], &Links::up);
     });
     // Links depend on the neighbours of both ends, thus on the rows beside, but on no other link
     // than those of their own row.
-    forEachRow(count, pool, [&](int k) {
+    forEach(pool, count, [&](int k) {
       const int row = rows_[k];
       const auto end = static_cast<std::int32_t>(image_.row_begin[row + 1]);
       for (auto i = static_cast<std::int32_t>(image_.row_begin[row]); i < end; ++i) {
@@ -553,7 +543,7 @@ BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool*
   const auto indexOf = [&](std::int32_t place) {
     return place == kNone ? kNone : static_cast<std::int32_t>(image.index[place]);
   };
-  forEachRow(image.rows(), pool, [&](int row) {
+  forEach(pool, image.rows(), [&](int row) {
     for (std::uint32_t place = image.row_begin[row]; place < image.row_begin[row + 1]; ++place) {
       const BeamGrid::Links& links = linker.links()[place];
       const std::uint32_t i = image.index[place];

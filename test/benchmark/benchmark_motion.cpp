@@ -4,13 +4,13 @@
 /// Transform nodelet does it, or for each firing, one thread. Both give one cloud for the scan.
 /// Compare rows of one run: absolute times depend on the machine and on its other work.
 #include <benchmark/benchmark.h>
-#include <malloc.h>
 
 #include <cmath>
 #include <cstring>
 #include <utility>
 #include <vector>
 
+#include "benchmark_main.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
 #ifdef SLF_BENCHMARK_PCL
 #include <pcl_ros/transforms.h>
@@ -163,11 +163,5 @@ BENCHMARK_CAPTURE(motionPeer, firing, 1)
 }  // namespace semantic_lidar_fusion
 
 int main(int argc, char** argv) {
-  // Freed memory stays with the process, as it does in a node that has run for a while.
-  mallopt(M_MMAP_THRESHOLD, 1 << 25);
-  mallopt(M_TRIM_THRESHOLD, 1 << 28);
-  benchmark::Initialize(&argc, argv);
-  if (benchmark::ReportUnrecognizedArguments(argc, argv)) return 1;
-  benchmark::RunSpecifiedBenchmarks();
-  return 0;
+  return semantic_lidar_fusion::runBenchmarksWithWarmHeap(argc, argv);
 }

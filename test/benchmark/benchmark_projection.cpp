@@ -4,7 +4,6 @@
 /// first and `cv::rectangle` masks, as in the paper; and the fusion of a whole scan. Compare rows
 /// of one run: absolute times depend on the machine and on its other work.
 #include <benchmark/benchmark.h>
-#include <malloc.h>
 
 #include <algorithm>
 #include <cmath>
@@ -17,6 +16,7 @@
 #include <string>
 #include <vector>
 
+#include "benchmark_main.h"
 #include "semantic_lidar_fusion/fusion/semantic_projector.h"
 #include "semantic_lidar_fusion/projection/cloud_projector.h"
 #include "semantic_lidar_fusion/projection/occlusion_mask.h"
@@ -235,11 +235,5 @@ BENCHMARK_CAPTURE(fuseRig, two_threads, OcclusionMode::kAdaptive, 2)
 
 int main(int argc, char** argv) {
   cv::setNumThreads(1);
-  // Freed memory stays with the process, as it does in a node that has run for a while.
-  mallopt(M_MMAP_THRESHOLD, 1 << 25);
-  mallopt(M_TRIM_THRESHOLD, 1 << 28);
-  benchmark::Initialize(&argc, argv);
-  if (benchmark::ReportUnrecognizedArguments(argc, argv)) return 1;
-  benchmark::RunSpecifiedBenchmarks();
-  return 0;
+  return semantic_lidar_fusion::runBenchmarksWithWarmHeap(argc, argv);
 }

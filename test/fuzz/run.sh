@@ -41,8 +41,8 @@ fuzz() {
   local corpus=$build_dir/corpus/$name log=$build_dir/$name.log
   mkdir -p "$corpus"
   SLF_FUZZ_SEEDS=$corpus "$program" >/dev/null
-  if ! "$program" -runs="$executions" -seed=1 -max_len="${SLF_FUZZ_LENGTH:-5000}" -timeout=20 -rss_limit_mb=2048 \
-    -artifact_prefix="$build_dir/findings/$name-" "$corpus" >"$log" 2>&1; then
+  if ! "$program" -runs="$executions" -seed=1 -max_len="${SLF_FUZZ_LENGTH:-5000}" \
+    -timeout=20 -rss_limit_mb=2048 -artifact_prefix="$build_dir/findings/$name-" "$corpus" >"$log" 2>&1; then
     tail -60 "$log"
     echo "fuzz_$name: a finding, see $log"
     return 1

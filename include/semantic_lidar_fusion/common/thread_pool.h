@@ -45,4 +45,7 @@ class ThreadPool {
   std::vector<std::thread> workers_;
 };
 
+/// The same on the threads of `pool`, or in order on this one if there is none.
+void forEach(ThreadPool* pool, int count, const std::function<void(int)>& work);
+
 }  // namespace semantic_lidar_fusion
