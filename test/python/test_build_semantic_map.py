@@ -75,6 +75,11 @@ def built(room, tmp_path_factory):
     return out
 
 
+def error_lines(done):
+    """What it says but for warnings: one stands where there is no liboctomap."""
+    return [line for line in done.stderr.splitlines() if ": warning: " not in line]
+
+
 def bytes_of(folder, name="map.voxels"):
     with open(os.path.join(str(folder), name), "rb") as file:
         return file.read()
@@ -318,7 +323,7 @@ def test_an_existing_folder_is_not_touched(room, built, tmp_path):
     before = bytes_of(built)
     done = run(room[0], "--tf", room[1], "--out", built)
     assert done.returncode == 1 and "--overwrite" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    assert len(error_lines(done)) == 1
     other = tmp_path / "precious"
     other.mkdir()
     (other / "thesis.tex").write_text("x")
@@ -377,7 +382,7 @@ def test_wrong_inputs_are_told_in_one_line(room, tmp_path):
     for arguments, word in cases[:7]:
         done = run(*arguments)
         assert done.returncode == 1 and word in done.stderr, (arguments, done.stderr)
-        assert len(done.stderr.splitlines()) == 1, done.stderr
+        assert len(error_lines(done)) == 1, done.stderr
     assert os.listdir(str(tmp_path)) == []
     assert run("--out", tmp_path / "x").returncode == 2
     assert run(fused, "--live", "points", "--out", tmp_path / "x").returncode == 2
@@ -392,7 +397,7 @@ def test_a_damaged_map_file_is_refused(built, tmp_path):
         path.write_bytes(data)
         done = run(path, "--out", tmp_path / "out")
         assert done.returncode == 1 and "cut.voxels" in done.stderr
-        assert len(done.stderr.splitlines()) == 1, done.stderr
+        assert len(error_lines(done)) == 1, done.stderr
         assert not (tmp_path / "out").exists()
 
 
