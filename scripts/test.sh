@@ -72,6 +72,9 @@ export LC_ALL=C.UTF-8 ROS_IP=127.0.0.1
 # A stock nodelet executable needs the sanitizer's library before everything else; the test files
 # take it as launch-prefix="$(optenv SLF_LAUNCH_PREFIX)".
 unset SLF_LAUNCH_PREFIX
+if [ -n "$sanitize" ]; then
+  export SLF_SOAK_RATE=${SLF_SOAK_RATE:-0.05} SLF_SOAK_MINUTES=${SLF_SOAK_MINUTES:-1.6}
+fi
 case $sanitize in
   address)
     # The ROS and OpenCV libraries keep objects until exit; only what our code leaks counts.

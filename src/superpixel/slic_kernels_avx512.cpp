@@ -101,13 +101,13 @@ inline __mmask64 insideMask(int column_count) {
 /// The next four visited rows from y on, the last one again where there are fewer; how many.
 inline int nextRows(const SlicBlock& block, int y, int rows[4]) {
   int count = 0;
+  int last = y;
   for (int i = 0; i < 4; ++i) {
     if (y < block.row_count) {
-      rows[i] = y;
+      last = y;
       ++count;
-    } else {
-      rows[i] = rows[i - 1];
     }
+    rows[i] = last;
     y += block.row_step;
   }
   return count;

@@ -37,6 +37,8 @@ cmake --build "$build_dir" --target fuzzers -- -j"$jobs" >"$probe/build.log" 2>&
 # itself, gives it.
 export ASAN_OPTIONS=detect_leaks=0:detect_stack_use_after_return=1:malloc_context_size=0
 export UBSAN_OPTIONS=print_stacktrace=1:halt_on_error=1
+# A caller's libraries of the same names are not instrumented.
+export LD_LIBRARY_PATH=$build_dir/devel/lib${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}
 mkdir -p "$build_dir/findings"
 fuzz() {
   local program=$1 name=$2
