@@ -10,6 +10,8 @@
 #include <cerrno>
 #include <cstdio>
 #include <cstring>
+#include <utility>
+#include <vector>
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -62,17 +64,9 @@ BagOutput::~BagOutput() {
   ::unlink(written_path_.c_str());
 }
 
-/// Closes the bag once. One that cannot be closed is left alone: its destructor would write to it
-/// again, and an exception there ends the program.
+/// Closes the bag once.
 void BagOutput::close() {
-  if (!bag_) return;
-  try {
-    bag_->close();
-    bag_.reset();
-  } catch (const std::exception& e) {
-    bag_.release();
-    fail(e.what());
-  }
+  if (bag_) guarded([&] { closeBag(std::move(bag_)); });
 }
 
 void BagOutput::commit() {
@@ -87,5 +81,15 @@ void BagOutput::commit() {
 }
 
 void BagOutput::fail(const std::string& why) { throw Error(path_ + ": cannot be written: " + why); }
+
+void closeBag(std::unique_ptr<rosbag::Bag> bag) {
+  try {
+    bag->close();
+  } catch (...) {
+    static auto* const kept = new std::vector<std::unique_ptr<rosbag::Bag>>;
+    kept->push_back(std::move(bag));
+    throw;
+  }
+}
 
 }  // namespace semantic_lidar_fusion

@@ -71,4 +71,8 @@ class BagOutput {
   bool committed_ = false;
 };
 
+/// Closes a bag, or throws rosbag's exception. One that cannot be closed is kept until the program
+/// ends: its destructor would write to it again, and an exception there ends the program.
+void closeBag(std::unique_ptr<rosbag::Bag> bag);
+
 }  // namespace semantic_lidar_fusion

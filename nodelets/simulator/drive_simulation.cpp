@@ -22,6 +22,7 @@
 #include <set>
 #include <vector>
 
+#include "bag_output.h"
 #include "camera.h"
 #include "conversions.h"
 #include "drive_path.h"
@@ -109,15 +110,12 @@ class Bag {
   }
 
  private:
-  /// Closes the bag once. One that cannot be closed is left alone: its destructor would write to it
-  /// again, and an exception there ends the program.
+  /// Closes the bag once.
   void close() {
     if (!bag_) return;
     try {
-      bag_->close();
-      bag_.reset();
+      closeBag(std::move(bag_));
     } catch (const rosbag::BagException& e) {
-      bag_.release();
       throw Error(path_ + ": cannot be written: " + e.what());
     }
   }

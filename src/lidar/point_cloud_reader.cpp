@@ -79,6 +79,7 @@ struct Field {
   std::string name;
   std::uint32_t offset = 0;
   std::uint8_t datatype = 0;
+  std::uint64_t count = 0;
 
   bool isInteger() const { return datatype != kFloat32 && datatype != kFloat64; }
 
@@ -148,7 +149,7 @@ Field findField(const PointCloudBytes& bytes, const std::string& name) {
              std::to_string(candidate.offset) + ", count " + std::to_string(candidate.count) +
              ") does not fit into a point_step of " + std::to_string(bytes.point_step));
     }
-    return {name, candidate.offset, candidate.datatype};
+    return {name, candidate.offset, candidate.datatype, count};
   }
   return {};
 }
@@ -181,11 +182,7 @@ Field findTime(const PointCloudBytes& bytes, const std::string& configured) {
       if (field.datatype != 0) break;
     }
   }
-  for (const PointFieldBytes& candidate : bytes.fields) {
-    if (candidate.name == field.name && candidate.datatype == kUint32 && candidate.count == 2) {
-      field.datatype = kUint64;
-    }
-  }
+  if (field.datatype == kUint32 && field.count == 2) field.datatype = kUint64;
   return field;
 }
 

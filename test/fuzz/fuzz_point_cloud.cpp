@@ -22,6 +22,7 @@ struct SeedField {
   unsigned name;
   std::uint32_t offset;
   std::uint8_t datatype;
+  std::uint32_t count = 1;
 };
 
 /// 6 points, each field with values that suit it.
@@ -33,7 +34,7 @@ Bytes cloudOf(const std::vector<SeedField>& fields, std::uint32_t point_step,
   writer.put(kWidth).put(kHeight).put(point_step).put(kWidth * point_step).byte(0);
   writer.byte(static_cast<unsigned>(fields.size()));
   for (const SeedField& field : fields) {
-    writer.byte(field.name).put(field.offset).byte(field.datatype).put(std::uint32_t{1});
+    writer.byte(field.name).put(field.offset).byte(field.datatype).put(field.count);
   }
   for (std::uint32_t i = 0; i < kWidth * kHeight; ++i) {
     Bytes bytes(point_step, 0);
@@ -84,6 +85,16 @@ std::vector<Bytes> seeds() {
         storeXyz(i, point);
         store(point + 12, std::uint64_t{1546300800000000000} + i * 10000000u);
       }));
+  all.push_back(
+      cloudOf(with({{9, 12, PointField::UINT32, 2}}), 20, [](std::uint32_t i, std::uint8_t* point) {
+        storeXyz(i, point);
+        store(point + 12, std::uint64_t{1546300800000000000} + i * 10000000u);
+      }));
+  all.push_back(cloudOf(with({{9, 12, PointField::UINT32}, {9, 0, PointField::UINT32, 2}}), 16,
+                        [](std::uint32_t i, std::uint8_t* point) {
+                          storeXyz(i, point);
+                          store(point + 12, i * 10000000u);
+                        }));
   all.push_back(cloudOf(with({{3, 12, PointField::FLOAT32},
                               {4, 16, PointField::UINT16},
                               {10, 20, PointField::FLOAT32},

@@ -474,6 +474,21 @@ TEST(PointCloudReader, RefusesImpossibleLayoutsAndNamesThem) {
   EXPECT_NE(errorOf(good().view(), config).find("no field 'when'"), std::string::npos);
 }
 
+TEST(PointCloudReader, OfFieldsOfOneNameTheFirstCounts) {
+  // Nothing of the second is checked, so nothing of it may decide what is read: 64 bits of time at
+  // the end of the last point would lie outside the data.
+  Message message(2, 1, 16);
+  message.xyz().field("t", 12, kUint32).field("t", 0, kUint32, 2).field("x", 12, kFloat64);
+  for (std::uint32_t i = 0; i < 2; ++i) {
+    message.set(i, 0, 5.0f + static_cast<float>(i));
+    message.set(i, 12, i * 1000u);
+  }
+  const ReadCloud read = PointCloudReader(PointCloudReaderConfig{}).read(message.view());
+  ASSERT_EQ(read.cloud.size(), 2u);
+  EXPECT_EQ(read.cloud.x[1], 6.0f);
+  EXPECT_EQ(read.cloud.time_ns[1] - read.cloud.time_ns[0], 1000);
+}
+
 TEST(PointCloudReader, RefusesABadConfiguration) {
   PointCloudReaderConfig config;
   config.min_range_m = 3.0;
