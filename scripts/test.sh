@@ -77,9 +77,7 @@ if [ -n "$sanitize" ]; then
 fi
 case $sanitize in
   address)
-    # The ROS and OpenCV libraries keep objects until exit; only what our code leaks counts.
     export ASAN_OPTIONS=detect_stack_use_after_return=1:strict_string_checks=1:exitcode=66
-    export LSAN_OPTIONS=suppressions=$source_dir/test/gate/lsan.supp:print_suppressions=0
     export SLF_LAUNCH_PREFIX="env LD_PRELOAD=$(g++ -print-file-name=libasan.so)"
     ;;
   thread)
