@@ -78,7 +78,6 @@ fi
 case $sanitize in
   address)
     export ASAN_OPTIONS=detect_stack_use_after_return=1:strict_string_checks=1:exitcode=66
-    ASAN_OPTIONS+=:suppressions=$source_dir/test/gate/asan.supp
     export SLF_LAUNCH_PREFIX="env LD_PRELOAD=$(g++ -print-file-name=libasan.so)"
     ;;
   thread)

@@ -68,6 +68,9 @@ class Recovery(unittest.TestCase):
             took = self.wait_for_fused_cloud(RECOVERY_S)
             print("recovered %.1f s after the crash" % took)
             self.assertNotEqual(live.pid_of(live.MANAGER), pid)
+            # When all end at once, bonds that break have the stock manager look for a nodelet in a
+            # table that it has destroyed. The one that follows this one has no bonds yet.
+            os.kill(live.pid_of(live.MANAGER), signal.SIGKILL)
 
     def test_manager_that_stands_still_goes_on_without_bonds(self):
         with live.launched("fusion.launch", rig=self.made.rig, bond="false"):
