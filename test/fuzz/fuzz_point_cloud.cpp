@@ -62,6 +62,10 @@ std::vector<Bytes> seeds() {
     more.insert(more.begin(), xyz.begin(), xyz.end());
     return more;
   };
+  const auto store_ns = [](std::uint32_t i, std::uint8_t* point) {
+    storeXyz(i, point);
+    store(point + 12, std::uint64_t{1546300800000000000} + i * 10000000u);
+  };
   std::vector<Bytes> all{Bytes{}};
   all.push_back(cloudOf(xyz, 12, storeXyz));
   all.push_back(cloudOf(with({{5, 12, PointField::UINT32}, {4, 16, PointField::UINT16}}), 20,
@@ -80,16 +84,8 @@ std::vector<Bytes> seeds() {
         storeXyz(i, point);
         store(point + 12, 1546300800.0 + 0.01 * i);
       }));
-  all.push_back(
-      cloudOf(with({{9, 12, PointField::FLOAT64}}), 20, [](std::uint32_t i, std::uint8_t* point) {
-        storeXyz(i, point);
-        store(point + 12, std::uint64_t{1546300800000000000} + i * 10000000u);
-      }));
-  all.push_back(
-      cloudOf(with({{9, 12, PointField::UINT32, 2}}), 20, [](std::uint32_t i, std::uint8_t* point) {
-        storeXyz(i, point);
-        store(point + 12, std::uint64_t{1546300800000000000} + i * 10000000u);
-      }));
+  all.push_back(cloudOf(with({{9, 12, PointField::FLOAT64}}), 20, store_ns));
+  all.push_back(cloudOf(with({{9, 12, PointField::UINT32, 2}}), 20, store_ns));
   all.push_back(cloudOf(with({{9, 12, PointField::UINT32}, {9, 0, PointField::UINT32, 2}}), 16,
                         [](std::uint32_t i, std::uint8_t* point) {
                           storeXyz(i, point);

@@ -32,9 +32,8 @@ cmake -S "$source_dir" -B "$build_dir" -DCMAKE_CXX_COMPILER=clang++ -DSLF_SANITI
 cmake --build "$build_dir" --target fuzzers -- -j"$jobs" >"$probe/build.log" 2>&1 ||
   { tail -50 "$probe/build.log"; exit 1; }
 
-# Leaks of the libraries' own singletons are none of ours, and no single input shows one. The stack of
-# every allocation would be kept for ever and costs a fifth of the time; a finding's input, run by
-# itself, gives it.
+# Leaks of the libraries' own singletons are none of ours, and no single input shows one. Stacks of
+# allocations would be kept for ever; a finding's input, run by itself, gives them.
 export ASAN_OPTIONS=detect_leaks=0:detect_stack_use_after_return=1:malloc_context_size=0
 export UBSAN_OPTIONS=print_stacktrace=1:halt_on_error=1
 # A caller's libraries of the same names are not instrumented.

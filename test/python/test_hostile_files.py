@@ -16,6 +16,7 @@ bag_factory = pytest.importorskip("bag_factory")
 pytest.importorskip("matplotlib")
 pytest.importorskip("cv2")
 import dataset_factory  # noqa: E402
+from command_line import assert_one_line  # noqa: E402
 from conftest import SOURCE_DIR  # noqa: E402
 
 BIN_DIR = os.environ.get("SLF_BIN_DIR", "")
@@ -83,15 +84,6 @@ DAMAGES = (
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     return Room(tmp_path_factory.mktemp("room"))
-
-
-def assert_one_line(code, errors, *words):
-    lines = [line for line in errors.strip().splitlines() if "warning:" not in line]
-    assert code == 1, errors
-    assert len(lines) == 1, errors
-    assert "error:" in lines[0]
-    for word in words:
-        assert word in lines[0], errors
 
 
 def files_below(folder):

@@ -70,7 +70,7 @@ class End(unittest.TestCase):
                         publishers[topic].publish(message)
                         rospy.rostime.wallsleep(0.002)
                         # Another moment in each round, with scans under way.
-                        if count > len(messages) // 2 + 5 * index % 40:
+                        if semantic.messages and count > len(messages) // 2 + 5 * index % 40:
                             break
                     live.wait_until(lambda: semantic.messages, "a cloud in round %d" % index)
                     manager.send_signal(signal.SIGINT)
