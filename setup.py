@@ -2,6 +2,6 @@
 """The Python package below scripts/, for catkin; do not run by hand."""
 
 from catkin_pkg.python_setup import generate_distutils_setup
-from setuptools import setup
+from setuptools import find_packages, setup
 
-setup(**generate_distutils_setup(packages=["semantic_lidar_fusion"], package_dir={"": "scripts"}))
+setup(**generate_distutils_setup(packages=find_packages("scripts"), package_dir={"": "scripts"}))

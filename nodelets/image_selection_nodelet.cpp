@@ -7,16 +7,16 @@
 #include <string>
 #include <vector>
 
-#include "camera_geometry.h"
-#include "conversions.h"
-#include "fusion_chain.h"
-#include "fusion_nodelet.h"
-#include "lidar_decoder.h"
+#include "base/fusion_nodelet.h"
+#include "edge/camera_geometry.h"
+#include "edge/conversions.h"
+#include "edge/fusion_chain.h"
+#include "edge/lidar_decoder.h"
+#include "edge/tf_subscription.h"
+#include "edge/topics.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 #include "semantic_lidar_fusion/sync/stamped_store.h"
-#include "tf_subscription.h"
-#include "topics.h"
 
 namespace semantic_lidar_fusion {
 namespace {

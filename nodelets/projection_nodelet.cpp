@@ -11,16 +11,16 @@
 #include <utility>
 #include <vector>
 
-#include "camera_geometry.h"
-#include "conversions.h"
-#include "fusion_chain.h"
-#include "fusion_nodelet.h"
+#include "base/fusion_nodelet.h"
+#include "edge/camera_geometry.h"
+#include "edge/conversions.h"
+#include "edge/fusion_chain.h"
+#include "edge/tf_subscription.h"
+#include "edge/topics.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/fusion_queue.h"
 #include "semantic_lidar_fusion/sync/stamped_store.h"
-#include "tf_subscription.h"
-#include "topics.h"
 
 namespace semantic_lidar_fusion {
 namespace {

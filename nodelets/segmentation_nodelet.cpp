@@ -9,11 +9,11 @@
 #include <thread>
 #include <vector>
 
-#include "conversions.h"
-#include "fusion_nodelet.h"
+#include "base/fusion_nodelet.h"
+#include "edge/conversions.h"
+#include "edge/topics.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/segmentation/model.h"
-#include "topics.h"
 
 namespace semantic_lidar_fusion {
 

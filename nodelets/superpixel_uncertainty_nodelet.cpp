@@ -12,14 +12,14 @@
 #include <utility>
 #include <vector>
 
-#include "conversions.h"
-#include "fusion_nodelet.h"
+#include "base/fusion_nodelet.h"
+#include "edge/conversions.h"
+#include "edge/topics.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/fusion/camera_semantics.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/stamped_store.h"
-#include "topics.h"
 
 namespace semantic_lidar_fusion {
 namespace {

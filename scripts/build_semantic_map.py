@@ -161,9 +161,9 @@ def main():
     options = parser.parse_args()
     check(parser, options)
     cli.require("numpy", "yaml", "rosbag", "scipy", "matplotlib", "cv2")
-    from semantic_lidar_fusion import semantic_map_run
+    from semantic_lidar_fusion.maps import run
 
-    print(semantic_map_run.build(options))
+    print(run.build(options))
 
 
 if __name__ == "__main__":

@@ -172,9 +172,9 @@ def main():
     options = parser.parse_args()
     check(parser, options)
     cli.require("numpy", "yaml", "rosbag", "matplotlib")
-    from semantic_lidar_fusion import evaluation_run
+    from semantic_lidar_fusion.evaluation import run
 
-    print(evaluation_run.evaluate(options))
+    print(run.evaluate(options))
 
 
 if __name__ == "__main__":

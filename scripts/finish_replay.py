@@ -45,7 +45,7 @@ def main():
     if options.evaluate and not (options.bag and options.recorded):
         parser.error("--evaluate needs --bag and --recorded")
     cli.require("numpy", "yaml", "rospy", "rosgraph")
-    from semantic_lidar_fusion import replay
+    from semantic_lidar_fusion.bags import replay
 
     replay.finish(options)
 

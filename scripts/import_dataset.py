@@ -173,20 +173,18 @@ def _positive(text):
 
 def read_drive(options, labels):
     """The records.Drive that the options ask for."""
-    from semantic_lidar_fusion import dataset_kitti, dataset_rellis, dataset_semantickitti
+    from semantic_lidar_fusion.datasets import kitti, rellis, semantickitti
 
     if options.dataset == "kitti":
-        return dataset_kitti.read(
-            options.folder, labels, options.cameras, options.first, options.last
-        )
+        return kitti.read(options.folder, labels, options.cameras, options.first, options.last)
     if options.dataset == "semantickitti":
-        return dataset_semantickitti.read(
+        return semantickitti.read(
             options.folder, labels, options.cameras, options.first, options.last
         )
-    return dataset_rellis.read(
+    return rellis.read(
         options.folder,
         labels,
-        dataset_rellis.DISTORTIONS[options.distortion],
+        rellis.DISTORTIONS[options.distortion],
         options.first,
         options.last,
     )
@@ -194,14 +192,14 @@ def read_drive(options, labels):
 
 def import_usyd(options, labels, rig_path):
     """A bag of the USyd Campus data set, whose messages pass as they are."""
-    from semantic_lidar_fusion import dataset_usyd
+    from semantic_lidar_fusion.datasets import usyd
 
-    summary = dataset_usyd.write(
+    summary = usyd.write(
         options.folder,
         options.bag,
         rig_path,
         labels,
-        dataset_usyd.Options(
+        usyd.Options(
             cameras=options.cameras,
             time_correction_s=options.time_correction,
             start_s=options.start,
@@ -211,8 +209,8 @@ def import_usyd(options, labels, rig_path):
             model=options.model,
         ),
     )
-    print("%s: %s" % (options.bag, dataset_usyd.describe(summary)))
-    dataset_usyd.warn_of_missing(summary)
+    print("%s: %s" % (options.bag, usyd.describe(summary)))
+    usyd.warn_of_missing(summary)
     print("%s: rig file" % rig_path)
 
 
@@ -222,7 +220,7 @@ def main():
     if options.dataset is None:
         parser.error("name a data set: kitti, semantickitti, rellis or usyd")
     cli.require("numpy", "yaml", "rosbag", "sensor_msgs.msg", "tf2_msgs.msg")
-    from semantic_lidar_fusion import dataset_writer
+    from semantic_lidar_fusion.datasets import writer
     from semantic_lidar_fusion.labels import LabelSet, package_file
 
     labels = LabelSet.from_file(options.classes or package_file(DEFAULT_CLASSES[options.dataset]))
@@ -231,11 +229,11 @@ def main():
         cli.require("cv2")
         return import_usyd(options, labels, rig_path)
     one_hot = getattr(options, "scores", "none") == "onehot"
-    summary = dataset_writer.write(
+    summary = writer.write(
         read_drive(options, labels),
         options.bag,
         rig_path,
-        dataset_writer.Options(
+        writer.Options(
             raw_images=options.images == "raw",
             score_stride=options.score_stride if one_hot else 0,
             score_gain=options.score_gain if one_hot else 0.0,

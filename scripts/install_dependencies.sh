@@ -21,8 +21,8 @@ done
 # name on Debian (ROS in the distribution itself)
 debian_ros="catkin libroscpp-dev libnodelet-dev libnodeletlib-dev libnodeletlib-tools pluginlib-dev
   libcv-bridge-dev libtf2-dev libtf2-ros-dev libtf2-eigen-dev libtf2-msgs-dev
-  libmessage-filters-dev libdiagnostic-updater-dev libsensor-msgs-dev libnav-msgs-dev
-  libstd-msgs-dev libgeometry-msgs-dev libdiagnostic-msgs-dev libroslib-dev librosbag-dev
+  libdiagnostic-updater-dev libsensor-msgs-dev libnav-msgs-dev
+  libstd-msgs-dev libgeometry-msgs-dev libdiagnostic-msgs-dev librosbag-dev
   librosbag-storage-dev librostest-dev python3-catkin-pkg python3-roslaunch python3-rosbag
   python3-rospy python3-cv-bridge python3-tf2-ros python3-tf2-msgs python3-sensor-msgs
   python3-nav-msgs python3-std-msgs python3-std-srvs python3-geometry-msgs python3-diagnostic-msgs
@@ -31,10 +31,10 @@ debian_ros="catkin libroscpp-dev libnodelet-dev libnodeletlib-dev libnodeletlib-
 # name on Ubuntu 20.04 with the ROS Noetic repository
 noetic_ros="ros-noetic-catkin ros-noetic-roscpp ros-noetic-nodelet ros-noetic-pluginlib
   ros-noetic-cv-bridge ros-noetic-tf2 ros-noetic-tf2-ros ros-noetic-tf2-eigen ros-noetic-tf2-msgs
-  ros-noetic-message-filters ros-noetic-diagnostic-updater ros-noetic-sensor-msgs
+  ros-noetic-diagnostic-updater ros-noetic-sensor-msgs
   ros-noetic-nav-msgs ros-noetic-std-msgs ros-noetic-std-srvs ros-noetic-geometry-msgs
   ros-noetic-diagnostic-msgs
-  ros-noetic-roslib ros-noetic-rosbag ros-noetic-rosbag-storage ros-noetic-roslaunch
+  ros-noetic-rosbag ros-noetic-rosbag-storage ros-noetic-roslaunch
   ros-noetic-rospy ros-noetic-rostopic ros-noetic-rosnode ros-noetic-rosparam ros-noetic-rostest
   ros-noetic-rosunit ros-noetic-rosbash ros-noetic-tf2-tools"
 common="build-essential cmake libeigen3-dev libopencv-dev libyaml-cpp-dev libgtest-dev

@@ -53,17 +53,17 @@ def _figures(text):
 def main():
     options = make_parser().parse_args()
     cli.require("numpy", "yaml", "rosbag", "matplotlib", "cv2")
-    from semantic_lidar_fusion import figures
+    from semantic_lidar_fusion.figures import paper_figures
     from semantic_lidar_fusion.errors import DataError
-    from semantic_lidar_fusion.evaluation import Rig
+    from semantic_lidar_fusion.evaluation.scoring import Rig
 
     if not options.force and os.path.isdir(options.out):
         old = [name for name in os.listdir(options.out) if name.startswith("figure")]
         if old:
             raise DataError("%s: holds %s; --force replaces them" % (options.out, min(old)))
     rig = Rig(options.rig)
-    scene = figures.load_scene(options.bag, options.source, rig, options.scan)
-    for path in figures.make(scene, options.out, options.figures, options.camera):
+    scene = paper_figures.load_scene(options.bag, options.source, rig, options.scan)
+    for path in paper_figures.make(scene, options.out, options.figures, options.camera):
         print(path)
 
 

@@ -26,7 +26,7 @@ def main():
     import rospy
 
     from semantic_lidar_fusion.errors import SemanticLidarFusionError
-    from semantic_lidar_fusion.semantic_map_server import SemanticMapServer
+    from semantic_lidar_fusion.maps.server import SemanticMapServer
 
     rospy.init_node("semantic_map")
     try:

@@ -18,9 +18,9 @@ import numpy as np
 SOURCE_DIR = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 sys.path.insert(0, os.path.join(SOURCE_DIR, "scripts"))
 
-from semantic_lidar_fusion.cloud_io import from_array, point_dtype  # noqa: E402
+from semantic_lidar_fusion.bags.cloud_io import from_array, point_dtype  # noqa: E402
 from semantic_lidar_fusion.labels import LabelSet, package_file  # noqa: E402
-from semantic_lidar_fusion.poses import to_message  # noqa: E402
+from semantic_lidar_fusion.bags.poses import to_message  # noqa: E402
 
 RINGS, COLUMNS = 16, 1875  # 30 000 points
 

@@ -29,7 +29,7 @@ import yaml
 
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..", "scripts"))
 
-from semantic_lidar_fusion import calibration, metrics  # noqa: E402
+from semantic_lidar_fusion.evaluation import calibration, metrics  # noqa: E402
 
 COLUMNS = 240
 WIDTHS = [1, 2, 3, 4, 6, 10]  # cells; the last class of widths is open

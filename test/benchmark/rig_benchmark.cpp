@@ -22,10 +22,10 @@
 #include <thread>
 #include <vector>
 
-#include "conversions.h"
+#include "edge/conversions.h"
+#include "edge/topics.h"
 #include "rig_player.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "topics.h"
 
 namespace semantic_lidar_fusion {
 namespace {

@@ -10,10 +10,10 @@
 #include <thread>
 #include <utility>
 
-#include "bag_input.h"
-#include "conversions.h"
+#include "edge/conversions.h"
+#include "edge/topics.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "topics.h"
+#include "tools/common/bag_input.h"
 
 namespace semantic_lidar_fusion {
 namespace {

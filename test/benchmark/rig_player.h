@@ -14,8 +14,8 @@
 #include <string>
 #include <vector>
 
+#include "edge/velodyne_messages.h"
 #include "semantic_lidar_fusion/config/rig.h"
-#include "velodyne_messages.h"
 
 namespace semantic_lidar_fusion {
 

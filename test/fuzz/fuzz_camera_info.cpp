@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 // sensor_msgs/CameraInfo to a camera model, and what the model says of points and pixels.
-#include "conversions.h"
+#include "edge/conversions.h"
 #include "fuzz_target.h"
 #include "semantic_lidar_fusion/camera/camera_model.h"
 #include "semantic_lidar_fusion/common/error.h"

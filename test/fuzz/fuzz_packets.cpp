@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
 // velodyne_msgs/VelodyneScan to points, as the nodelets and fuse_bag read it.
+#include "edge/lidar_decoder.h"
 #include "fuzz_target.h"
-#include "lidar_decoder.h"
 #include "packet_encoder.h"
 #include "semantic_lidar_fusion/common/error.h"
 

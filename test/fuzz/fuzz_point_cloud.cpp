@@ -2,9 +2,9 @@
 // sensor_msgs/PointCloud2 of a lidar driver to points with times, and of `points_compensated`.
 #include <sensor_msgs/PointCloud2.h>
 
-#include "conversions.h"
+#include "edge/conversions.h"
+#include "edge/lidar_decoder.h"
 #include "fuzz_target.h"
-#include "lidar_decoder.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {

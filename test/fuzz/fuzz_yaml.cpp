@@ -5,9 +5,9 @@
 #include <fstream>
 #include <sstream>
 
-#include "fusion_chain.h"
+#include "edge/fusion_chain.h"
+#include "edge/lidar_decoder.h"
 #include "fuzz_target.h"
-#include "lidar_decoder.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 #include "semantic_lidar_fusion/config/rig.h"

@@ -154,7 +154,7 @@ def test_plugin_descriptions_match_the_exports():
 def test_subscriptions_do_not_wait_for_nagle():
     """All subscriptions are made in two places, both with tcpNoDelay."""
     places = set()
-    for path in files("nodelets/*.h") + files("nodelets/*.cpp"):
+    for path in files("nodelets/**/*.h") + files("nodelets/**/*.cpp"):
         text = text_of(path)
         found = len(re.findall(r"\bhandle\.subscribe<|NodeHandle\(\)\.subscribe<", text))
         if found:

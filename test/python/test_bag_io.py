@@ -10,7 +10,7 @@ pytest.importorskip("rosbag")
 from sensor_msgs.msg import Image  # noqa: E402
 from std_msgs.msg import Int32, String  # noqa: E402
 
-from semantic_lidar_fusion import bag_io  # noqa: E402
+from semantic_lidar_fusion.bags import bag_io  # noqa: E402
 from semantic_lidar_fusion.errors import DataError  # noqa: E402
 
 

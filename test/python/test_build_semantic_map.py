@@ -20,10 +20,10 @@ pytest.importorskip("rosbag")
 import bag_factory  # noqa: E402
 from command_line import assert_one_line  # noqa: E402
 
-from semantic_lidar_fusion import semantic_map_raster  # noqa: E402
+from semantic_lidar_fusion.maps import raster  # noqa: E402
 from semantic_lidar_fusion.labels import LabelSet  # noqa: E402
-from semantic_lidar_fusion.semantic_map import MapConfig, native_module, read  # noqa: E402
-from semantic_lidar_fusion.semantic_map_file import MapReader  # noqa: E402
+from semantic_lidar_fusion.maps.semantic_map import MapConfig, native_module, read  # noqa: E402
+from semantic_lidar_fusion.maps.map_file import MapReader  # noqa: E402
 
 SOURCE_DIR = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))
 SCRIPT = os.path.join(SOURCE_DIR, "scripts", "build_semantic_map.py")
@@ -139,7 +139,7 @@ def test_a_dask_cluster_gives_the_same_bytes(room, built, tmp_path):
 
 
 def test_without_the_compiled_module_the_same_bytes(room, built, tmp_path, monkeypatch):
-    from semantic_lidar_fusion import semantic_map_build as build
+    from semantic_lidar_fusion.maps import build
 
     reader = MapReader(os.path.join(built, "map.voxels"))
     drive = build.Drive(room[0], (room[1],))
@@ -152,7 +152,7 @@ def test_without_the_compiled_module_the_same_bytes(room, built, tmp_path, monke
 
 
 def test_maps_add_up(room, built, tmp_path):
-    from semantic_lidar_fusion import semantic_map_build as build
+    from semantic_lidar_fusion.maps import build
 
     reader = MapReader(os.path.join(built, "map.voxels"))
     drive = build.Drive(room[0], (room[1],))
@@ -400,9 +400,9 @@ def test_costs_of_classes():
     tree = [{"name": n, "color": [i, i, i], "dynamic": n == "car"} for i, n in enumerate(names)]
     labels = LabelSet.from_tree(tree, "test")
     with open(os.path.join(SOURCE_DIR, "config", "map_costs.yaml")) as file:
-        costs = semantic_map_raster.Costs.from_tree(yaml.safe_load(file), labels, "costs")
+        costs = raster.Costs.from_tree(yaml.safe_load(file), labels, "costs")
     config = MapConfig(voxel_size_m=1.0, weight=1.0).checked(5)
-    from semantic_lidar_fusion.semantic_map import record_dtype
+    from semantic_lidar_fusion.maps.semantic_map import record_dtype
 
     rows = [  # x, z, class (None: no class), last_ns
         (0, 0, "road", 0),
@@ -422,7 +422,7 @@ def test_costs_of_classes():
         if name is not None:
             record["labelled"] = 1
             record["evidence"][names.index(name)] = 5 << 20
-    frame = semantic_map_raster.Frame2d.around((0, 0), (8, 0), 1.0)
-    rasters = semantic_map_raster.rasterise(lambda: [records], frame, config, costs)
+    frame = raster.Frame2d.around((0, 0), (8, 0), 1.0)
+    rasters = raster.rasterise(lambda: [records], frame, config, costs)
     assert rasters.cost[0].tolist() == [0, 60, 100, 0, 100, 0, 100, -1, -1]
     assert rasters.label[0].tolist() == [0, 1, 2, 3, 0, 0, 0, 255, 255]

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from semantic_lidar_fusion import cloud_io
+from semantic_lidar_fusion.bags import cloud_io
 from semantic_lidar_fusion.errors import DataError
 
 sensor_msgs = pytest.importorskip("sensor_msgs.msg")

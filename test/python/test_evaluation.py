@@ -10,9 +10,9 @@ bag_factory = pytest.importorskip("bag_factory")
 import rosbag  # noqa: E402
 
 from bag_factory import START_NS, Drive  # noqa: E402
-from semantic_lidar_fusion import evaluation, image_truth  # noqa: E402
-from semantic_lidar_fusion.bag_io import BagWriter  # noqa: E402
-from semantic_lidar_fusion.cloud_io import from_array, point_dtype  # noqa: E402
+from semantic_lidar_fusion.evaluation import image_truth, scoring  # noqa: E402
+from semantic_lidar_fusion.bags.bag_io import BagWriter  # noqa: E402
+from semantic_lidar_fusion.bags.cloud_io import from_array, point_dtype  # noqa: E402
 from semantic_lidar_fusion.errors import ConfigError, DataError  # noqa: E402
 from semantic_lidar_fusion.labels import NO_LABEL, LabelSet  # noqa: E402
 
@@ -301,7 +301,7 @@ def test_options_that_do_not_fit_together(run_command, arguments, message):
 
 def test_pairs_of_scans_and_truth():
     ms = 10**6
-    pair = evaluation.pair_scans
+    pair = scoring.pair_scans
     # As many of both: in order, even where the stamp tells another moment of the scan.
     assert pair([100 * ms, 200 * ms], [0, 100 * ms]) == [0, 1]
     # A few labelled scans of many; a scan without truth nearby.
@@ -314,7 +314,7 @@ def test_configurations_follow_the_rig(tmp_path):
     def names(text, *settings):
         path = tmp_path / "r.yaml"
         path.write_text(RIG_CLASSES + text)
-        return [c.name for c in evaluation.Rig(str(path), settings).configurations()]
+        return [c.name for c in scoring.Rig(str(path), settings).configurations()]
 
     assert names("") == ["direct", "motion", "motion_mask"]
     assert names("motion: {enabled: false}\n") == ["direct", "mask"]
@@ -327,8 +327,8 @@ def test_configurations_follow_the_rig(tmp_path):
 def test_labelled_images_become_points_on_their_pixels(tmp_path):
     import cv2
 
-    from semantic_lidar_fusion.bag_io import BagReader
-    from semantic_lidar_fusion.cloud_io import to_array
+    from semantic_lidar_fusion.bags.bag_io import BagReader
+    from semantic_lidar_fusion.bags.cloud_io import to_array
 
     random = np.random.RandomState(1)
     labels = random.randint(0, 6, (12, 16)).astype(np.uint8)
@@ -339,7 +339,7 @@ def test_labelled_images_become_points_on_their_pixels(tmp_path):
     classes = LabelSet.from_tree([{"name": n, "color": [1, 2, 3]} for n in NAMES], "classes")
     paths = [str(tmp_path / name) for name in ("o.bag", "o.yaml")]
     image_truth.write_bag(images, classes, "m.yaml", 3, *paths)
-    assert evaluation.Rig(paths[1]).labels == classes
+    assert scoring.Rig(paths[1]).labels == classes
     with BagReader(paths[0]) as bag:
         (truth,) = [to_array(item.message) for item in bag.read(["/points_truth"])]
         (info,) = [item.message for item in bag.read(["/camera/camera_info"])]

@@ -9,9 +9,10 @@ import pytest
 bag_factory = pytest.importorskip("bag_factory")
 cv2 = pytest.importorskip("cv2")
 from bag_factory import CLASS_NAMES, Drive  # noqa: E402
-from semantic_lidar_fusion import evaluation, figures  # noqa: E402
+from semantic_lidar_fusion.evaluation import scoring  # noqa: E402
+from semantic_lidar_fusion.figures import paper_figures  # noqa: E402
 from semantic_lidar_fusion.cameras import Camera  # noqa: E402
-from semantic_lidar_fusion.cloud_io import FUSED, OCCLUDED  # noqa: E402
+from semantic_lidar_fusion.bags.cloud_io import FUSED, OCCLUDED  # noqa: E402
 from semantic_lidar_fusion.errors import DataError  # noqa: E402
 
 
@@ -91,7 +92,7 @@ def test_rectified_images_use_p():
 
 
 def test_boundaries_of_superpixels():
-    edge = figures.boundaries(np.array([[0, 0, 1], [0, 2, 1]]))
+    edge = paper_figures.boundaries(np.array([[0, 0, 1], [0, 2, 1]]))
     assert edge.tolist() == [[False, True, False], [True, True, False]]
 
 
@@ -100,14 +101,14 @@ def test_images_of_all_encodings():
 
     values = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
     message = Image(height=2, width=3, encoding="32FC4", step=48, data=values.tobytes())
-    np.testing.assert_array_equal(figures.image_array(message), values)
+    np.testing.assert_array_equal(paper_figures.image_array(message), values)
     pixels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
     padded = np.concatenate([pixels.reshape(2, 6), np.zeros((2, 2), np.uint8)], axis=1)
     message = Image(height=2, width=2, encoding="bgr8", step=8, data=padded.tobytes())
-    np.testing.assert_array_equal(figures.rgb_of(message), pixels[..., ::-1])
+    np.testing.assert_array_equal(paper_figures.rgb_of(message), pixels[..., ::-1])
     message.encoding = "yuv"
     with pytest.raises(DataError, match="yuv"):
-        figures.image_array(message)
+        paper_figures.image_array(message)
 
 
 @pytest.fixture(scope="module")
@@ -128,19 +129,19 @@ def fused(tmp_path_factory):
 
 
 def test_projection_agrees_with_the_fused_cloud(fused):
-    scene = figures.load_scene(fused[0], fused[1], evaluation.Rig(fused[2]))
+    scene = paper_figures.load_scene(fused[0], fused[1], scoring.Rig(fused[2]))
     cloud = scene.cloud
     assert len(scene.views) == len(Drive().cameras)
     for view in scene.views:
         assert view.image is not None and view.scores.shape[2] == len(CLASS_NAMES)
-        got = figures.project_cloud(cloud, view)
+        got = paper_figures.project_cloud(cloud, view)
         bits = (cloud.optional("cameras") >> view.bit) & 1
         # Every contribution is a point drawn and kept; only the image's rim may round otherwise.
         assert abs(int((~got.removed).sum()) - int(bits.sum())) <= 2
         # A kept point shows the class that the cloud took from that pixel.
         size = view.image.shape[1::-1]
-        label = figures._resized(view.labels(), size)
-        points = figures.transform_points(view.to_camera, cloud.xyz)
+        label = paper_figures._resized(view.labels(), size)
+        points = paper_figures.transform_points(view.to_camera, cloud.xyz)
         pixel, inside = view.camera.project(points)
         inside &= cloud.optional("cameras") == 1 << view.bit
         u, v = np.floor(pixel[inside] + 0.5).astype(int).T
@@ -150,8 +151,8 @@ def test_projection_agrees_with_the_fused_cloud(fused):
 
 
 def test_panorama_shows_the_classes_around(fused):
-    scene = figures.load_scene(fused[0], fused[1], evaluation.Rig(fused[2]))
-    picture, seen, extent = figures.panorama(scene, columns=600)
+    scene = paper_figures.load_scene(fused[0], fused[1], scoring.Rig(fused[2]))
+    picture, seen, extent = paper_figures.panorama(scene, columns=600)
     assert picture.shape[:2] == seen.shape and 500 < picture.shape[1] < 720
     left, right, bottom, top = extent
     assert 180 >= left > right >= -180 and top > 0 > bottom

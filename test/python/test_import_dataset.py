@@ -12,9 +12,9 @@ pytest.importorskip("rosbag")
 cv2 = pytest.importorskip("cv2")
 import dataset_factory as made  # noqa: E402
 
-from semantic_lidar_fusion import bag_io, cloud_io, poses  # noqa: E402
-from semantic_lidar_fusion import dataset_kitti, dataset_records  # noqa: E402
-from semantic_lidar_fusion import dataset_rellis, dataset_writer  # noqa: E402
+from semantic_lidar_fusion.bags import bag_io, cloud_io, poses  # noqa: E402
+from semantic_lidar_fusion.datasets import kitti, records  # noqa: E402
+from semantic_lidar_fusion.datasets import rellis, writer  # noqa: E402
 from semantic_lidar_fusion.errors import DataError  # noqa: E402
 from semantic_lidar_fusion.labels import LabelSet, package_file  # noqa: E402
 
@@ -213,7 +213,7 @@ class TestKitti:
 def test_sweep_direction_and_uneven_halves():
     angles = np.radians([179.999, 135, 90, 0.001, 0, -90, -179.999])
     xyz = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1) * 7
-    times = dataset_records.sweep_times(xyz, 1000, 1000 + 40000, 1000 + 100000)
+    times = records.sweep_times(xyz, 1000, 1000 + 40000, 1000 + 100000)
     np.testing.assert_allclose(times, [0, 10000, 20000, 40000, 40000, 70000, 100000], atol=1)
 
 
@@ -222,9 +222,9 @@ def test_rings_keep_the_largest_falls():
     last = np.radians(np.where(np.arange(70) < 64, 350.0, 300.0))
     angles = np.stack([np.full(70, np.radians(5.0)), last], axis=1).reshape(-1)
     xyz = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
-    rings = dataset_records.rings_of_rows(xyz)
+    rings = records.rings_of_rows(xyz)
     assert rings[0] == 63 and rings[-1] == 0 and len(np.unique(rings)) == 64
-    assert len(dataset_records.rings_of_rows(np.zeros((0, 3)))) == 0
+    assert len(records.rings_of_rows(np.zeros((0, 3)))) == 0
 
 
 def test_rings_of_scans_that_are_not_laser_by_laser():
@@ -246,7 +246,7 @@ def test_rings_of_scans_that_are_not_laser_by_laser():
         np.random.RandomState(1).permutation(len(xyz)),
         np.arange(len(xyz)).reshape(64, 90).T.reshape(-1),
     ):
-        assert (dataset_records.rings_of_scan(xyz[order]) == truth[order]).all()
+        assert (records.rings_of_scan(xyz[order]) == truth[order]).all()
 
 
 def test_overflowed_coordinates_return_to_their_place():
@@ -256,7 +256,7 @@ def test_overflowed_coordinates_return_to_their_place():
     units = np.rint(xyz / 0.002).astype(np.int64)
     overflowed = (np.abs(units) > 32767).any(axis=1)
     assert overflowed.sum() > 50
-    found = dataset_kitti.unfold_compact(units.astype(np.int16))
+    found = kitti.unfold_compact(units.astype(np.int16))
     np.testing.assert_allclose(found, xyz, atol=0.0011)
 
 
@@ -267,7 +267,7 @@ class TestSemanticKitti:
         )
         # Seven of eight points have a class, `unlabeled` among them.
         assert not err and "21 labelled points" in out
-        stamps = [dataset_records.EPOCH_NS + ns for ns in (0, 103646000, 207302000)]
+        stamps = [records.EPOCH_NS + ns for ns in (0, 103646000, 207302000)]
         for topic in ("/velodyne_points", "/points_truth", "/camera_2/image/compressed"):
             assert got.stamps(topic) == stamps
         cloud, truth = got.cloud("/velodyne_points"), got.cloud("/points_truth")
@@ -412,7 +412,7 @@ class TestRellis:
 def test_one_hot_cells_follow_the_interface():
     # Cell i of n lies over pixel floor((i + 0.5) * m / n) of m.
     labels = np.arange(7 * 10).reshape(7, 10).astype(np.uint8)
-    scores = dataset_writer.one_hot_scores(labels, 100, 3, 1.0)
+    scores = writer.one_hot_scores(labels, 100, 3, 1.0)
     assert scores.shape == (3, 4, 100)
     for i in range(3):
         for j in range(4):
@@ -622,7 +622,7 @@ def test_images_too_far_are_said(run_command, tmp_path):
 def test_unknown_class_set_for_the_data():
     with pytest.raises(DataError, match="has no class of this data set"):
         labels = LabelSet.from_tree({"classes": [{"name": "x", "color": [0, 0, 0]}]}, "x")
-        dataset_records.class_table({1: ["road"]}, labels)
+        records.class_table({1: ["road"]}, labels)
 
 
 class TestCompactKitti:
@@ -636,7 +636,7 @@ class TestCompactKitti:
         )
         assert not err and "2 scans" in out and "2 images" in out
         images = got.stamps("/camera_02/image/compressed")
-        assert images == [dataset_records.EPOCH_NS + n * 10**8 for n in (2, 3)]
+        assert images == [records.EPOCH_NS + n * 10**8 for n in (2, 3)]
         # The image is taken at the middle of the sweep.
         assert got.stamps("/velodyne_points") == [ns - 5 * 10**7 for ns in images]
         cloud = got.cloud("/velodyne_points")
@@ -703,7 +703,7 @@ class TestCompactRellis:
         message = got.messages["/pylon/scores"][0]
         assert (message.width, message.height, message.encoding) == (240, 150, "32FC20")
         labels = LabelSet.from_tree(got.rig["classes"], "rig")
-        drive = dataset_rellis.read(folder, labels, (), 0, None)
+        drive = rellis.read(folder, labels, (), 0, None)
         human = drive.label_values(drive.cameras[0].images[0].label_path)
         # Human labels at the points' pixels agree with the points' labels on 77.3 %, as known.
         k = np.array(got.messages["/pylon/camera_info"][0].K).reshape(3, 3)

@@ -11,7 +11,7 @@ import yaml
 pytest.importorskip("rosbag")
 cv2 = pytest.importorskip("cv2")
 
-from semantic_lidar_fusion import bag_io  # noqa: E402
+from semantic_lidar_fusion.bags import bag_io  # noqa: E402
 
 SCRIPT = "import_dataset.py"
 WIDTH, HEIGHT, FRAMES = 160, 96, 9

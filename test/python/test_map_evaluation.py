@@ -4,14 +4,14 @@
 import numpy as np
 
 from semantic_lidar_fusion.labels import ClassInfo, LabelSet
-from semantic_lidar_fusion.map_evaluation import (
+from semantic_lidar_fusion.evaluation.map_scoring import (
     TrueVoxels,
     VoxelIndex,
     compare_weights,
     iou,
 )
-from semantic_lidar_fusion.metrics import Confusion
-from semantic_lidar_fusion.semantic_map import MapConfig, VoxelMap
+from semantic_lidar_fusion.evaluation.metrics import Confusion
+from semantic_lidar_fusion.maps.semantic_map import MapConfig, VoxelMap
 
 LABELS = LabelSet([ClassInfo("road", (1, 2, 3), False), ClassInfo("wall", (4, 5, 6), False)])
 

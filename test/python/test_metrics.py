@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from semantic_lidar_fusion import calibration
+from semantic_lidar_fusion.evaluation import calibration
 from semantic_lidar_fusion.errors import DataError
 from semantic_lidar_fusion.labels import NO_LABEL
-from semantic_lidar_fusion.metrics import Confusion, Reliability, Visibility
+from semantic_lidar_fusion.evaluation.metrics import Confusion, Reliability, Visibility
 
 
 def random_case(seed, points=4000, rows=5):

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from semantic_lidar_fusion import poses
+from semantic_lidar_fusion.bags import poses
 from semantic_lidar_fusion.errors import DataError
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation

@@ -7,8 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from semantic_lidar_fusion.bag_io import BagReader, BagWriter, message_class, to_stamp
-from semantic_lidar_fusion.cloud_io import SemanticCloud, to_array
+from semantic_lidar_fusion.bags.bag_io import BagReader, BagWriter, message_class, to_stamp
+from semantic_lidar_fusion.bags.cloud_io import SemanticCloud, to_array
 
 SOURCE_DIR = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))
 

@@ -9,7 +9,7 @@ import pytest
 
 from semantic_lidar_fusion.errors import ConfigError, DataError
 from semantic_lidar_fusion.labels import ClassInfo, LabelSet
-from semantic_lidar_fusion.semantic_map import (
+from semantic_lidar_fusion.maps.semantic_map import (
     DYNAMIC,
     STATIC,
     MapConfig,

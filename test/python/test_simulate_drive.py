@@ -10,7 +10,7 @@ import pytest
 
 rosbag = pytest.importorskip("rosbag")
 
-from semantic_lidar_fusion import cloud_io  # noqa: E402
+from semantic_lidar_fusion.bags import cloud_io  # noqa: E402
 
 PROGRAM = os.path.join(os.environ.get("SLF_BIN_DIR", ""), "simulate_drive")
 pytestmark = pytest.mark.skipif(

@@ -10,7 +10,7 @@ import pytest
 rosbag = pytest.importorskip("rosbag")
 
 from conftest import SOURCE_DIR  # noqa: E402
-from semantic_lidar_fusion import evaluation  # noqa: E402
+from semantic_lidar_fusion.evaluation import scoring  # noqa: E402
 
 BIN_DIR = os.environ.get("SLF_BIN_DIR", "")
 PROGRAMS = [os.path.join(BIN_DIR, name) for name in ("simulate_drive", "fuse_bag")]
@@ -33,13 +33,13 @@ def test_nothing_is_wrong_where_nothing_is_uncertain(tmp_path):
     simulate = [PROGRAMS[0], "--out", bag, "--duration", "0.3", "--scale", "0.3", "--quiet"]
     run(*(simulate + ["--exact", "--static", "--speed", "15"]))
     run(PROGRAMS[1], bag, fused, "--rig", RIG, "--quiet")
-    rig = evaluation.Rig(RIG)
-    truth = evaluation.Truth(str(bag), len(rig.labels))
-    clouds = evaluation.FusedBag(str(fused), rig.labels.names)
-    score = evaluation.Score("exact", rig.labels, 1.5)
+    rig = scoring.Rig(RIG)
+    truth = scoring.Truth(str(bag), len(rig.labels))
+    clouds = scoring.FusedBag(str(fused), rig.labels.names)
+    score = scoring.Score("exact", rig.labels, 1.5)
     names = [camera["name"] for camera in rig.cameras]
     checked, wrong = np.zeros(len(names), int), np.zeros(len(names), int)
-    for _, cloud, scan in evaluation.paired(truth, clouds):
+    for _, cloud, scan in scoring.paired(truth, clouds):
         chosen = score.select(cloud, scan)
         bits = cloud.optional("cameras")
         bad = cloud.label != scan.label
@@ -60,14 +60,14 @@ def test_each_step_helps_on_a_fast_drive(tmp_path):
     bag = tmp_path / "drive.bag"
     simulate = [PROGRAMS[0], "--out", bag, "--duration", "0.3", "--scale", "0.3", "--quiet"]
     run(*(simulate + ["--perfect-network", "--static", "--speed", "15"]))
-    rig = evaluation.Rig(RIG)
-    truth = evaluation.Truth(str(bag), len(rig.labels))
+    rig = scoring.Rig(RIG)
+    truth = scoring.Truth(str(bag), len(rig.labels))
     scores = []
     for configuration in rig.configurations():
         fused = str(tmp_path / (configuration.name + ".bag"))
-        evaluation.run_fuse_bag(PROGRAMS[1], str(bag), fused, RIG, configuration.settings)
-        clouds = evaluation.FusedBag(fused, rig.labels.names)
-        scores.append(evaluation.score_bag(configuration.name, clouds, truth, rig.labels))
+        scoring.run_fuse_bag(PROGRAMS[1], str(bag), fused, RIG, configuration.settings)
+        clouds = scoring.FusedBag(fused, rig.labels.names)
+        scores.append(scoring.score_bag(configuration.name, clouds, truth, rig.labels))
     accuracy = [score.confusion.accuracy for score in scores]
     assert accuracy[0] < accuracy[1] < accuracy[2]
     first, last = scores[0].confusion, scores[2].confusion

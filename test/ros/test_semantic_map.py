@@ -26,12 +26,12 @@ from std_msgs.msg import String  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
-from semantic_lidar_fusion.cloud_io import from_array, point_dtype, to_array  # noqa: E402
-from semantic_lidar_fusion.cloud_io import SemanticCloud  # noqa: E402
+from semantic_lidar_fusion.bags.cloud_io import from_array, point_dtype, to_array  # noqa: E402
+from semantic_lidar_fusion.bags.cloud_io import SemanticCloud  # noqa: E402
 from semantic_lidar_fusion.labels import LabelSet  # noqa: E402
-from semantic_lidar_fusion.poses import to_message  # noqa: E402
-from semantic_lidar_fusion.semantic_map import MapConfig, VoxelMap  # noqa: E402
-from semantic_lidar_fusion.semantic_map_file import MapReader  # noqa: E402
+from semantic_lidar_fusion.bags.poses import to_message  # noqa: E402
+from semantic_lidar_fusion.maps.semantic_map import MapConfig, VoxelMap  # noqa: E402
+from semantic_lidar_fusion.maps.map_file import MapReader  # noqa: E402
 
 CLASSES = {
     "classes": [

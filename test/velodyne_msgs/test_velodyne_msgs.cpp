@@ -9,8 +9,8 @@
 #include <type_traits>
 #include <vector>
 
-#include "conversions.h"
-#include "lidar_decoder.h"
+#include "edge/conversions.h"
+#include "edge/lidar_decoder.h"
 #include "packet_encoder.h"
 
 namespace semantic_lidar_fusion {

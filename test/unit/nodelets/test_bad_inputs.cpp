@@ -11,15 +11,15 @@
 #include <opencv2/core.hpp>
 #include <set>
 
-#include "conversions.h"
-#include "lidar_decoder.h"
+#include "edge/conversions.h"
+#include "edge/lidar_decoder.h"
+#include "edge/tf_pose_source.h"
 #include "packet_encoder.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/fusion/semantic_projector.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
-#include "tf_pose_source.h"
 
 namespace semantic_lidar_fusion {
 namespace {

@@ -7,7 +7,7 @@
 #include <thread>
 #include <vector>
 
-#include "inbox.h"
+#include "base/inbox.h"
 
 namespace semantic_lidar_fusion {
 namespace {

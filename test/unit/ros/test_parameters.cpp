@@ -4,7 +4,7 @@
 
 #include <string>
 
-#include "parameters.h"
+#include "base/parameters.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {

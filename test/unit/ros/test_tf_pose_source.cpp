@@ -6,8 +6,8 @@
 #include <limits>
 #include <random>
 
-#include "conversions.h"
-#include "tf_pose_source.h"
+#include "edge/conversions.h"
+#include "edge/tf_pose_source.h"
 
 namespace semantic_lidar_fusion {
 namespace {

@@ -1,0 +1,39 @@
+// SPDX-License-Identifier: MIT
+#pragma once
+
+#include <memory>
+#include <optional>
+#include <string>
+
+#include "edge/conversions.h"
+#include "semantic_lidar_fusion/camera/camera_model.h"
+#include "semantic_lidar_fusion/config/rig.h"
+
+namespace semantic_lidar_fusion {
+
+/// The model of one camera, derived anew whenever its camera_info changes.
+class CameraGeometry {
+ public:
+  explicit CameraGeometry(const CameraConfig& config)
+      : options_{config.rectified, config.max_theta_deg} {}
+
+  /// Throws DataError if the camera_info is unusable; the camera has no model then.
+  void update(const sensor_msgs::CameraInfo& message) {
+    const CameraInfo info = cameraInfo(message);
+    if (info_ && *info_ == info) return;
+    model_.reset();
+    info_ = info;
+    model_ = std::make_shared<const CameraModel>(info, options_);
+  }
+
+  const std::shared_ptr<const CameraModel>& model() const { return model_; }
+  /// Empty until a camera_info came.
+  std::string frame() const { return info_ ? info_->frame_id : std::string(); }
+
+ private:
+  CameraModelOptions options_;
+  std::optional<CameraInfo> info_;
+  std::shared_ptr<const CameraModel> model_;
+};
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,93 @@
+// SPDX-License-Identifier: MIT
+/// Between ROS messages and the core's types: free functions without state, named for their result.
+///
+/// Every function that reads a message checks it first and throws DataError with the field, what
+/// was found and what is wanted; the caller adds the topic. Nothing here changes its input.
+#pragma once
+
+#include <geometry_msgs/Pose.h>
+#include <geometry_msgs/Transform.h>
+#include <sensor_msgs/CameraInfo.h>
+#include <sensor_msgs/CompressedImage.h>
+#include <sensor_msgs/Image.h>
+#include <sensor_msgs/PointCloud2.h>
+#include <sensor_msgs/TimeReference.h>
+#include <std_msgs/String.h>
+
+#include <opencv2/core.hpp>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "edge/velodyne_messages.h"
+#include "semantic_lidar_fusion/camera/camera_model.h"
+#include "semantic_lidar_fusion/common/label_set.h"
+#include "semantic_lidar_fusion/common/point_cloud.h"
+#include "semantic_lidar_fusion/common/types.h"
+#include "semantic_lidar_fusion/lidar/packet.h"
+
+namespace semantic_lidar_fusion {
+
+// --- Time and frames
+
+inline StampNs stampNs(const ros::Time& time) { return static_cast<StampNs>(time.toNSec()); }
+/// Throws DataError outside ROS's range (0 to 2^32 s).
+ros::Time rosTime(StampNs stamp);
+/// Without leading slashes, which tf2 refuses.
+std::string frameName(const std::string& frame_id);
+
+// --- Images
+
+/// The message's own pixels, any encoding of the form 8UC3, 32FC12, mono8, bgr8 ...; nothing is
+/// copied, so the message must outlive the result, which must not be written to. Throws DataError
+/// on an unknown encoding, the other endianness, or a step or data size that does not fit.
+cv::Mat pixelView(const sensor_msgs::Image& message);
+/// CV_8UC1 (mono encodings) or CV_8UC3 in BGR order (everything else that cv_bridge converts).
+/// Shares the message's pixels where they have that form already: see pixelView.
+cv::Mat colorImage(const sensor_msgs::ImageConstPtr& message);
+/// JPEG, PNG and whatever else cv::imdecode reads: CV_8UC1 or CV_8UC3 in BGR order. EXIF rotation
+/// is ignored: the pixels are those of camera_info.
+cv::Mat decodedImage(const sensor_msgs::CompressedImage& message);
+/// Encoding after the type: mono8, bgr8, else e.g. 32SC1 or 32FC12.
+sensor_msgs::ImagePtr imageMessage(const cv::Mat& pixels, const std_msgs::Header& header);
+
+CameraInfo cameraInfo(const sensor_msgs::CameraInfo& message);
+
+// --- Lidar input
+
+std::vector<Packet> packets(const VelodyneScan& message);
+
+// --- Clouds
+
+/// `points_compensated`: x y z intensity f32, ring u16, dt f32, status u8.
+sensor_msgs::PointCloud2Ptr compensatedCloudMessage(const Cloud& cloud);
+/// Reads `points_compensated` back; fields may stand anywhere, `intensity`, `ring`, `dt` and
+/// `status` may be absent. `first_point_ns` is the stamp plus the least dt, exact to some ns only.
+Cloud compensatedCloud(const sensor_msgs::PointCloud2& message);
+
+/// `points_semantic`: x y z intensity f32, ring u16, dt f32, rgb f32, label u8, confidence f32,
+/// entropy f32, cameras u16, status u8, p_<class> f32 for each class. Throws DataError if the
+/// cloud's class count is not that of `classes`.
+sensor_msgs::PointCloud2Ptr semanticCloudMessage(const SemanticCloud& cloud,
+                                                 const LabelSet& classes);
+/// Colour (0xRRGGBB) of points without a class.
+constexpr std::uint32_t kNoClassRgb = 0x606060;
+
+// --- Decisions
+
+/// header.stamp = the scan's first point, time_ref = t_ref.
+sensor_msgs::TimeReference scanReferenceMessage(StampNs scan_ns, StampNs reference_ns);
+/// header.stamp = the scan's first point, time_ref = raw stamp of the image, 0 = none.
+sensor_msgs::TimeReference selectionMessage(StampNs scan_ns,
+                                            const std::optional<StampNs>& image_stamp,
+                                            const std::string& camera);
+
+std_msgs::String classInfoMessage(const LabelSet& classes);
+
+// --- Poses
+
+/// Throws DataError if a number is not finite or the quaternion's norm is further than 1e-2 from 1.
+Transform transform(const geometry_msgs::Transform& message);
+Transform transform(const geometry_msgs::Pose& message);
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,98 @@
+// SPDX-License-Identifier: MIT
+#include "edge/lidar_decoder.h"
+
+#include <utility>
+
+#include "edge/conversions.h"
+#include "semantic_lidar_fusion/common/error.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+PacketDecoderConfig packetConfig(const LidarConfig& lidar) {
+  PacketDecoderConfig config;
+  config.model = lidar.model;
+  config.packet_stamp = lidar.packet_stamp;
+  config.time_offset_ns = toNs(lidar.time_offset_s);
+  config.min_range_m = lidar.min_range_m;
+  config.max_range_m = lidar.max_range_m;
+  config.vertical_offsets_m = lidar.vertical_offsets_m;
+  return config;
+}
+
+PointCloudReaderConfig cloudConfig(const LidarConfig& lidar) {
+  PointCloudReaderConfig config;
+  config.time_field = lidar.time_field;
+  config.time_unit = lidar.time_unit;
+  config.time_reference = lidar.time_reference;
+  config.without_time = lidar.without_time;
+  config.time_offset_ns = toNs(lidar.time_offset_s);
+  config.min_range_m = lidar.min_range_m;
+  config.max_range_m = lidar.max_range_m;
+  return config;
+}
+
+PointCloudBytes cloudBytes(const sensor_msgs::PointCloud2& message, const std::string& frame) {
+  PointCloudBytes bytes;
+  bytes.header_stamp = stampNs(message.header.stamp);
+  bytes.frame_id = frame;
+  bytes.width = message.width;
+  bytes.height = message.height;
+  bytes.point_step = message.point_step;
+  bytes.row_step = message.row_step;
+  bytes.is_bigendian = message.is_bigendian != 0;
+  for (const auto& field : message.fields) {
+    bytes.fields.push_back({field.name, field.offset, field.datatype, field.count});
+  }
+  bytes.data = message.data.data();
+  bytes.size = message.data.size();
+  return bytes;
+}
+
+}  // namespace
+
+LidarDecoder::LidarDecoder(const LidarConfig& config, CountDrops count_drops,
+                           CountDrops count_left_out)
+    : config_(config),
+      count_drops_(std::move(count_drops)),
+      count_left_out_(count_left_out ? std::move(count_left_out) : count_drops_),
+      packets_(packetConfig(config)),
+      clouds_(cloudConfig(config)) {}
+
+std::string LidarDecoder::frame(const std::string& message_frame) const {
+  const std::string frame = frameName(config_.frame.empty() ? message_frame : config_.frame);
+  if (frame.empty()) {
+    throw DataError(
+        "header.frame_id is empty; it must name the lidar's frame, or the rig file must "
+        "(lidar.frame)");
+  }
+  return frame;
+}
+
+TimedCloud LidarDecoder::decode(const VelodyneScan& message) {
+  DecodedScan scan = packets_.decode(packets(message), stampNs(message.header.stamp),
+                                     frame(message.header.frame_id));
+  const PacketCounters& counters = scan.counters;
+  count_drops_("duplicate packets", counters.duplicate_packets);
+  count_drops_("packets of zeros", counters.zero_packets);
+  count_drops_("bad packet blocks", counters.bad_blocks);
+  count_left_out_("points out of range", counters.out_of_range_points);
+  count_left_out_("second returns equal to the first", counters.equal_returns);
+  for (const auto& [reason, count] : counters.unknown_packets) {
+    count_drops_("packets with " + reason, count);
+  }
+  return std::move(scan.cloud);
+}
+
+TimedCloud LidarDecoder::decode(const sensor_msgs::PointCloud2& message) {
+  ReadCloud read = clouds_.read(cloudBytes(message, frame(message.header.frame_id)));
+  count_left_out_("points that are not finite", read.counters.non_finite_points);
+  count_left_out_("points out of range", read.counters.out_of_range_points);
+  if (!read.cloud.empty()) {
+    time_decision_ = read.time.text;
+    time_decision_is_doubtful_ = read.time.warning;
+  }
+  return std::move(read.cloud);
+}
+
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,79 @@
+// SPDX-License-Identifier: MIT
+#include "tools/common/bag_input.h"
+
+#include <sys/stat.h>
+
+#include <cerrno>
+#include <cstring>
+#include <exception>
+
+#include "semantic_lidar_fusion/common/error.h"
+
+namespace semantic_lidar_fusion {
+namespace {
+
+/// What rosbag says badly or not at all.
+void checkFile(const std::string& path) {
+  struct stat status {};
+  if (::stat(path.c_str(), &status) != 0) throw Error(path + ": " + std::strerror(errno));
+  if (S_ISDIR(status.st_mode)) throw Error(path + ": is a directory, not a bag");
+  if (status.st_size == 0) throw Error(path + ": is an empty file, not a bag");
+}
+
+}  // namespace
+
+std::string bareTopic(const std::string& topic) {
+  const std::size_t begin = topic.find_first_not_of('/');
+  return begin == std::string::npos ? std::string() : topic.substr(begin);
+}
+
+std::string bagErrorText(const std::string& path, const std::exception& error) {
+  if (dynamic_cast<const rosbag::BagUnindexedException*>(&error)) {
+    return path + ": the bag has no index (was its recording cut short?); run: rosbag reindex " +
+           path;
+  }
+  return path + ": " + error.what();
+}
+
+BagInput::BagInput(const std::string& path) : path_(path) {
+  checkFile(path);
+  try {
+    bag_.open(path, rosbag::bagmode::Read);
+    rosbag::View view(bag_);
+    for (const rosbag::ConnectionInfo* connection : view.getConnections()) {
+      Topic& topic = topics_[bareTopic(connection->topic)];
+      topic.name = connection->topic;
+      topic.datatype = connection->datatype;
+    }
+    // One pass over the index; messages are not read.
+    for (const rosbag::MessageInstance& message : view) {
+      ++topics_.at(bareTopic(message.getTopic())).messages;
+    }
+  } catch (const std::exception& e) {
+    throw Error(bagErrorText(path, e));
+  }
+  if (topics_.empty()) throw Error(path + ": the bag holds no messages");
+}
+
+const BagInput::Topic* BagInput::find(const std::string& topic) const {
+  const auto found = topics_.find(bareTopic(topic));
+  return found == topics_.end() || found->second.messages == 0 ? nullptr : &found->second;
+}
+
+std::string BagInput::candidates(const std::string& datatype) const {
+  constexpr std::size_t kShown = 8;
+  std::vector<std::string> names;
+  for (const auto& topic : topics_) {
+    if (topic.second.datatype == datatype) names.push_back(topic.second.name);
+  }
+  std::string text = "topics of type " + datatype + ": ";
+  if (names.empty()) {
+    text = "no topic of type " + datatype + "; all topics: ";
+    for (const auto& topic : topics_) names.push_back(topic.second.name);
+  }
+  for (std::size_t i = 0; i < names.size() && i < kShown; ++i) text += (i ? ", " : "") + names[i];
+  if (names.size() > kShown) text += " (" + std::to_string(names.size() - kShown) + " more)";
+  return text;
+}
+
+}  // namespace semantic_lidar_fusion

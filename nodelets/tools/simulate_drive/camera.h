@@ -1,0 +1,53 @@
+// SPDX-License-Identifier: MIT
+/// Pictures of the world through a lens, with what each pixel shows.
+#pragma once
+
+#include <Eigen/Core>
+#include <cstdint>
+#include <opencv2/core.hpp>
+#include <vector>
+
+#include "semantic_lidar_fusion/camera/camera_model.h"
+#include "tools/simulate_drive/world.h"
+
+namespace semantic_lidar_fusion {
+namespace simulator {
+
+struct Picture {
+  cv::Mat image;   ///< CV_8UC3, BGR
+  cv::Mat labels;  ///< CV_8UC1: the class at each pixel's centre
+};
+
+class Camera {
+ public:
+  Camera(const CameraInfo& info, const Transform& T_base_camera);
+
+  /// At the world's instant. The same bytes for every number of threads.
+  Picture render(const World& world, const Transform& T_world_base, std::uint64_t key,
+                 int threads) const;
+
+  const CameraInfo& info() const { return info_; }
+  const CameraModel& model() const { return model_; }
+  const Transform& T_base_camera() const { return T_base_camera_; }
+
+ private:
+  CameraInfo info_;
+  CameraModel model_;
+  Transform T_base_camera_;
+  std::vector<Eigen::Vector3f> rays_;  ///< of the pixels' corners' middles, by row
+};
+
+/// 1-px precision is enough nowhere: distance in px from each pixel's centre to the border of the
+/// nearest pixel of another class. CV_32FC1; at most the image's diagonal.
+cv::Mat distanceToClassEdge(const cv::Mat& labels);
+
+/// What a lidar sees of a material: the share of light that comes back, and the share of pulses
+/// that are lost in glass and the like.
+struct LidarResponse {
+  float reflectivity = 0.3F;
+  float lost = 0.0F;
+};
+LidarResponse lidarResponse(Material material, const Eigen::Vector3f& tint);
+
+}  // namespace simulator
+}  // namespace semantic_lidar_fusion

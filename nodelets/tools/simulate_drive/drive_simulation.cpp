@@ -1,0 +1,584 @@
+// SPDX-License-Identifier: MIT
+#include "tools/simulate_drive/drive_simulation.h"
+
+#include <nav_msgs/Odometry.h>
+#include <rosbag/bag.h>
+#include <sensor_msgs/CameraInfo.h>
+#include <sensor_msgs/CompressedImage.h>
+#include <sensor_msgs/Image.h>
+#include <sensor_msgs/PointCloud2.h>
+#include <sys/stat.h>
+#include <tf2_msgs/TFMessage.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdio>
+#include <cstring>
+#include <iterator>
+#include <map>
+#include <memory>
+#include <opencv2/imgcodecs.hpp>
+#include <set>
+#include <vector>
+
+#include "edge/conversions.h"
+#include "edge/fusion_chain.h"
+#include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/lidar/packet_decoder.h"
+#include "semantic_lidar_fusion/sync/scan_selector.h"
+#include "tools/common/bag_output.h"
+#include "tools/common/progress_bar.h"
+#include "tools/simulate_drive/camera.h"
+#include "tools/simulate_drive/drive_path.h"
+#include "tools/simulate_drive/lidar.h"
+#include "tools/simulate_drive/network.h"
+#include "tools/simulate_drive/noise.h"
+#include "tools/simulate_drive/rig.h"
+#include "tools/simulate_drive/street.h"
+#include "tools/simulate_drive/visibility.h"
+
+namespace semantic_lidar_fusion {
+namespace simulator {
+namespace {
+
+constexpr StampNs kStartNs = StampNs{1535562000} * kNsPerSecond;  // stamp of time 0
+constexpr double kOdometryHz = 100.0;
+constexpr double kOdometryMarginS = 0.4;  // before and after the drive
+constexpr double kImageMarginS = 0.1;
+constexpr double kImagePhaseS = 0.0113;  // images keep no step with the lidar
+constexpr int kReferenceCamera = 0;
+constexpr StampNs kScoreDelayNs = 40000000;
+constexpr int kScoreStride = 8;  // full-resolution pixels a cell
+// A car's wheel encoders and gyroscope.
+constexpr double kSpeedScaleSigma = 0.005, kSpeedSigma = 0.03;    // of the speed; m/s
+constexpr double kYawBiasSigma = 8.7e-4, kYawRateSigma = 2.6e-3;  // rad/s
+constexpr double kTiltSigma = 5e-4;                               // rad
+constexpr int kJpegQuality = 92;
+
+/// A bag that takes its name when it is whole.
+class Bag {
+ public:
+  Bag(const std::string& path, bool force) : path_(path), temporary_(path + ".tmp") {
+    struct stat status {};
+    if (::stat(path.c_str(), &status) == 0) {
+      if (!S_ISREG(status.st_mode)) throw Error(path + ": exists and is not a file");
+      if (!force) throw Error(path + ": exists; give --force to replace it");
+    }
+    try {
+      bag_->open(temporary_, rosbag::bagmode::Write);
+      bag_->setCompression(rosbag::compression::LZ4);
+    } catch (const rosbag::BagException& e) {
+      throw Error(path + ": cannot be written: " + e.what());
+    }
+  }
+  ~Bag() {
+    if (committed_) return;
+    try {
+      close();
+    } catch (const Error&) {
+      // Of no interest: the file goes.
+    }
+    ::unlink(temporary_.c_str());
+  }
+  Bag(const Bag&) = delete;
+  Bag& operator=(const Bag&) = delete;
+
+  template <typename Message>
+  void write(const std::string& topic, StampNs record_ns, const Message& message,
+             bool latched = false) {
+    auto header = boost::make_shared<ros::M_string>();
+    (*header)["topic"] = topic;
+    (*header)["type"] = ros::message_traits::datatype(message);
+    (*header)["md5sum"] = ros::message_traits::md5sum(message);
+    (*header)["message_definition"] = ros::message_traits::definition(message);
+    (*header)["callerid"] = "/simulate_drive";
+    (*header)["latching"] = latched ? "1" : "0";
+    try {
+      bag_->write(topic, rosTime(record_ns), message, header);
+    } catch (const rosbag::BagException& e) {
+      throw Error(path_ + ": cannot be written: " + e.what());
+    }
+  }
+
+  void commit() {
+    close();
+    if (std::rename(temporary_.c_str(), path_.c_str()) != 0) {
+      throw Error(path_ + ": cannot be written: " + std::strerror(errno));
+    }
+    committed_ = true;
+  }
+
+ private:
+  /// Closes the bag once.
+  void close() {
+    if (!bag_) return;
+    try {
+      closeBag(std::move(bag_));
+    } catch (const rosbag::BagException& e) {
+      throw Error(path_ + ": cannot be written: " + e.what());
+    }
+  }
+
+  std::string path_, temporary_;
+  std::unique_ptr<rosbag::Bag> bag_ = std::make_unique<rosbag::Bag>();
+  bool committed_ = false;
+};
+
+std_msgs::Header headerOf(StampNs stamp, const std::string& frame) {
+  std_msgs::Header header;
+  header.stamp = rosTime(stamp);
+  header.frame_id = frame;
+  return header;
+}
+
+geometry_msgs::TransformStamped transformMessage(const Transform& T, StampNs stamp,
+                                                 const std::string& parent,
+                                                 const std::string& child) {
+  const Eigen::Quaterniond q(T.linear());
+  geometry_msgs::TransformStamped message;
+  message.header = headerOf(stamp, parent);
+  message.child_frame_id = child;
+  message.transform.translation.x = T.translation().x();
+  message.transform.translation.y = T.translation().y();
+  message.transform.translation.z = T.translation().z();
+  message.transform.rotation.x = q.x();
+  message.transform.rotation.y = q.y();
+  message.transform.rotation.z = q.z();
+  message.transform.rotation.w = q.w();
+  return message;
+}
+
+nav_msgs::Odometry odometryMessage(const Transform& T, double speed, double yaw_rate, StampNs stamp,
+                                   const std::string& parent, const std::string& child) {
+  const Eigen::Quaterniond q(T.linear());
+  nav_msgs::Odometry message;
+  message.header = headerOf(stamp, parent);
+  message.child_frame_id = child;
+  message.pose.pose.position.x = T.translation().x();
+  message.pose.pose.position.y = T.translation().y();
+  message.pose.pose.position.z = T.translation().z();
+  message.pose.pose.orientation.x = q.x();
+  message.pose.pose.orientation.y = q.y();
+  message.pose.pose.orientation.z = q.z();
+  message.pose.pose.orientation.w = q.w();
+  message.twist.twist.linear.x = speed;
+  message.twist.twist.angular.z = yaw_rate;
+  return message;
+}
+
+/// Dead reckoning from wheel speed and yaw rate; begins at the true pose.
+class Odometry {
+ public:
+  Odometry(const DrivePath& path, std::uint64_t seed, bool exact)
+      : path_(path), random_(mixKeys(seed, 0x0D0)), exact_(exact) {
+    scale_ = 1.0 + kSpeedScaleSigma * random_.normal();
+    bias_ = kYawBiasSigma * random_.normal();
+  }
+
+  /// The next reading; times must rise.
+  Transform next(double time_s) {
+    const Transform truth = path_.pose(time_s);
+    const PathPoint now = path_.roadAt(path_.distance(time_s));
+    if (exact_) return truth;
+    if (!started_) {
+      x_ = now.x;
+      y_ = now.y;
+      heading_ = now.heading;
+      started_ = true;
+    } else {
+      const double dt = time_s - last_s_;
+      const double step =
+          scale_ * (now.distance - last_.distance) + kSpeedSigma * random_.normal() * dt;
+      const double turn =
+          now.heading - last_.heading + (bias_ + kYawRateSigma * random_.normal()) * dt;
+      x_ += step * std::cos(heading_ + 0.5 * turn);
+      y_ += step * std::sin(heading_ + 0.5 * turn);
+      heading_ += turn;
+    }
+    // Attitude errors last for some tenths of a second.
+    tilt_x_ = 0.97 * tilt_x_ + 0.24 * kTiltSigma * random_.normal();
+    tilt_y_ = 0.97 * tilt_y_ + 0.24 * kTiltSigma * random_.normal();
+    last_ = now;
+    last_s_ = time_s;
+    Transform T = Transform::Identity();
+    T.translation() = Eigen::Vector3d(x_, y_, truth.translation().z());
+    const Eigen::Matrix3d tilt = (Eigen::AngleAxisd(tilt_y_, Eigen::Vector3d::UnitY()) *
+                                  Eigen::AngleAxisd(tilt_x_, Eigen::Vector3d::UnitX()))
+                                     .toRotationMatrix();
+    T.linear() =
+        Eigen::AngleAxisd(heading_ - now.heading, Eigen::Vector3d::UnitZ()).toRotationMatrix() *
+        truth.linear() * tilt;
+    return T;
+  }
+
+ private:
+  const DrivePath& path_;
+  Random random_;
+  bool exact_;
+  bool started_ = false;
+  double scale_ = 1.0, bias_ = 0.0;
+  double x_ = 0.0, y_ = 0.0, heading_ = 0.0, tilt_x_ = 0.0, tilt_y_ = 0.0;
+  double last_s_ = 0.0;
+  PathPoint last_;
+};
+
+struct Scan {
+  SimulatedScan simulated;
+  TimedCloud cloud;  ///< as the package decodes it
+  ScanInterval interval;
+  /// Bit i: PointView of camera i.
+  std::vector<std::uint16_t> visible, catchable, apart, silhouette;
+  std::vector<float> edge_px;  ///< point by point, the cameras in turn; negative: not seen
+  StampNs record_ns = 0;
+};
+
+class Simulation {
+ public:
+  Simulation(const SimulationOptions& options, void (*checkpoint)())
+      : options_(options),
+        checkpoint_(checkpoint),
+        path_(options.duration_s, options.speed_mps),
+        cameras_(makeCameras(options.scale, options.camera_drop_m)),
+        odometry_(path_, options.seed, options.exact_odometry) {}
+
+  void run() {
+    Bag bag(options_.output, options_.force);
+    StreetOptions street;
+    street.seed = options_.seed;
+    street.moving = options_.moving;
+    buildStreet(path_, street, &world_);
+    simulateScans();
+    listImages();
+    selectImages();
+    writeStatic(&bag);
+    ProgressBar progress("images", images_.size(), !options_.quiet);
+    std::size_t done = 0;
+    for (const StampNs stamp : images_) {
+      writeUntil(stamp, &bag);
+      renderImages(stamp, &bag);
+      checkpoint_();
+      progress.update(++done);
+    }
+    writeUntil(kStartNs + toNs(options_.duration_s + 2.0 * kOdometryMarginS), &bag);
+    bag.commit();
+  }
+
+ private:
+  void simulateScans() {
+    LidarOptions lidar;
+    lidar.seed = options_.seed;
+    lidar.start_ns = kStartNs;
+    lidar.T_base_lidar = lidarPose();
+    lidar.range_noise = options_.range_noise;
+    lidar.threads = options_.threads;
+    const PacketDecoder decoder{PacketDecoderConfig{}};
+    const int count = static_cast<int>(std::floor(10.0 * options_.duration_s + 1e-6));
+    ProgressBar progress("lidar scans", static_cast<std::size_t>(count), !options_.quiet);
+    for (int i = 0; i < count; ++i) {
+      Scan scan;
+      scan.simulated =
+          simulateScan(path_, lidar, firstPacketOfScan(i), firstPacketOfScan(i + 1), &world_);
+      const StampNs last = scan.simulated.packets.back().stamp;
+      scan.record_ns = last + packetPeriodNs();
+      scan.cloud = decoder.decode(scan.simulated.packets, last, kLidarFrame).cloud;
+      if (scan.cloud.size() != scan.simulated.echoes.size()) {
+        throw Error("the decoder finds other points than were simulated");
+      }
+      scan.interval = scanInterval(scan.cloud);
+      scan.visible.assign(scan.cloud.size(), 0);
+      scan.catchable = scan.apart = scan.silhouette = scan.visible;
+      scan.edge_px.assign(scan.cloud.size() * cameras_.size(), -1.0F);
+      scans_.push_back(std::move(scan));
+      checkpoint_();
+      progress.update(static_cast<std::size_t>(i) + 1);
+    }
+  }
+
+  void listImages() {
+    const double period = 1.0 / options_.image_rate_hz;
+    const int first = static_cast<int>(std::ceil((-kImageMarginS - kImagePhaseS) / period));
+    for (int k = first; k * period + kImagePhaseS <= options_.duration_s + kImageMarginS; ++k) {
+      images_.push_back(kStartNs + toNs(k * period + kImagePhaseS));
+    }
+  }
+
+  /// Which scans use which images: what the package itself decides on these stamps.
+  void selectImages() {
+    SelectorConfig config;
+    config.cameras.resize(cameras_.size());
+    config.image_choice = options_.image_choice;
+    const bool sweeps = options_.image_choice == ImageChoice::kClosestToSweep;
+    ScanSelector selector(config);
+    std::map<StampNs, std::size_t> scan_of;
+    std::size_t next_image = 0;
+    const auto take = [&](const SelectorDecisions& decisions) {
+      for (const SelectionDecision& decision : decisions.selections) {
+        if (!decision.image_stamp) continue;
+        used_[*decision.image_stamp][decision.camera].push_back(scan_of.at(decision.scan_ns));
+      }
+    };
+    const auto addImagesUntil = [&](StampNs until) {
+      for (; next_image < images_.size() && images_[next_image] <= until; ++next_image) {
+        for (std::size_t c = 0; c < cameras_.size(); ++c) {
+          selector.addImage(static_cast<int>(c), images_[next_image]);
+        }
+        take(selector.advance(images_[next_image]));
+      }
+    };
+    for (std::size_t i = 0; i < scans_.size(); ++i) {
+      addImagesUntil(scans_[i].record_ns);
+      scan_of[scans_[i].interval.first_ns] = i;
+      SelectorScan scan{scans_[i].interval, {}};
+      for (const MountedCamera& mounted : cameras_) {
+        if (!sweeps) break;
+        const Transform T_camera_lidar = mounted.camera.T_base_camera().inverse() * lidarPose();
+        scan.sweep_ns.push_back(
+            sweepTime(scans_[i].cloud,
+                      {std::make_shared<CameraModel>(mounted.camera.model()), T_camera_lidar}));
+      }
+      selector.addScan(scan, scans_[i].record_ns);
+      take(selector.advance(scans_[i].record_ns));
+    }
+    addImagesUntil(images_.back());
+    take(selector.finish());
+    // Live, the choice for the last scan is settled by a later image of the reference camera.
+    const auto later = std::upper_bound(images_.begin(), images_.end(),
+                                        used_.empty() ? kStartNs : std::prev(used_.end())->first);
+    if (later != images_.end()) used_[*later][kReferenceCamera];
+    if (!options_.all_images) {
+      images_.erase(std::remove_if(images_.begin(), images_.end(),
+                                   [&](StampNs stamp) { return used_.count(stamp) == 0; }),
+                    images_.end());
+    }
+  }
+
+  void writeStatic(Bag* bag) {
+    const StampNs stamp = kStartNs - toNs(kOdometryMarginS);
+    tf2_msgs::TFMessage transforms;
+    transforms.transforms.push_back(transformMessage(lidarPose(), stamp, "base_link", kLidarFrame));
+    for (const MountedCamera& mounted : cameras_) {
+      transforms.transforms.push_back(transformMessage(
+          mounted.camera.T_base_camera(), stamp, "base_link", mounted.camera.info().frame_id));
+    }
+    bag->write("/tf_static", stamp, transforms, true);
+  }
+
+  /// Odometry, camera_info and scans, as they come in time.
+  void writeUntil(StampNs until, Bag* bag) {
+    const int last =
+        static_cast<int>(std::floor((options_.duration_s + kOdometryMarginS) * kOdometryHz));
+    const int first = -static_cast<int>(kOdometryMarginS * kOdometryHz);
+    for (; first + readings_ <= last; ++readings_) {
+      const double time = (first + readings_) / kOdometryHz;
+      const StampNs stamp = kStartNs + toNs(time);
+      if (stamp > until) break;
+      const Transform T = odometry_.next(time);
+      tf2_msgs::TFMessage transforms;
+      transforms.transforms.push_back(transformMessage(T, stamp, "odom", "base_link"));
+      bag->write("/tf", stamp, transforms);
+      bag->write(
+          "/zio/odometry/rear", stamp,
+          odometryMessage(T, path_.speed(time), path_.yawRate(time), stamp, "odom", "base_link"));
+      bag->write("/truth/poses", stamp,
+                 odometryMessage(path_.pose(time), path_.speed(time), path_.yawRate(time), stamp,
+                                 "world", "base_link"));
+      if (readings_ % static_cast<int>(kOdometryHz) == 0) writeCameraInfos(stamp, bag);
+    }
+    for (; written_scans_ < scans_.size() && scans_[written_scans_].record_ns <= until;
+         ++written_scans_) {
+      writeScan(scans_[written_scans_], bag);
+    }
+  }
+
+  void writeCameraInfos(StampNs stamp, Bag* bag) {
+    for (const MountedCamera& mounted : cameras_) {
+      const CameraInfo& info = mounted.camera.info();
+      sensor_msgs::CameraInfo message;
+      message.header = headerOf(stamp, info.frame_id);
+      message.width = static_cast<std::uint32_t>(info.size.width);
+      message.height = static_cast<std::uint32_t>(info.size.height);
+      message.distortion_model = info.distortion_model;
+      message.D = info.d;
+      std::copy(info.k.begin(), info.k.end(), message.K.begin());
+      std::copy(info.r.begin(), info.r.end(), message.R.begin());
+      std::copy(info.p.begin(), info.p.end(), message.P.begin());
+      bag->write("/gmsl/" + mounted.name + "/camera_info", stamp, message, true);
+    }
+  }
+
+  void writeScan(const Scan& scan, Bag* bag) {
+    VelodyneScan message;
+    message.header = headerOf(scan.simulated.packets.back().stamp, kLidarFrame);
+    for (const Packet& packet : scan.simulated.packets) {
+      VelodynePacket raw;
+      raw.stamp = rosTime(packet.stamp);
+      std::copy(packet.data.begin(), packet.data.end(), raw.data.begin());
+      message.packets.push_back(raw);
+    }
+    bag->write(kLidarTopic, scan.record_ns, message);
+    bag->write("/points_truth", scan.record_ns, truthMessage(scan));
+  }
+
+  sensor_msgs::PointCloud2 truthMessage(const Scan& scan) const {
+    sensor_msgs::PointCloud2 message;
+    message.header = headerOf(scan.interval.first_ns, kLidarFrame);
+    std::uint32_t offset = 0;
+    const auto addField = [&](const std::string& name, std::uint32_t at, std::uint8_t type,
+                              std::uint32_t size) {
+      sensor_msgs::PointField field;
+      field.name = name;
+      field.offset = at;
+      field.datatype = type;
+      field.count = 1;
+      message.fields.push_back(field);
+      offset = at + size;
+    };
+    addField("x", 0, sensor_msgs::PointField::FLOAT32, 4);
+    addField("y", 4, sensor_msgs::PointField::FLOAT32, 4);
+    addField("z", 8, sensor_msgs::PointField::FLOAT32, 4);
+    addField("label", 12, sensor_msgs::PointField::UINT8, 1);
+    addField("visible", 14, sensor_msgs::PointField::UINT16, 2);
+    addField("surface", 16, sensor_msgs::PointField::UINT32, 4);
+    addField("edge_px", 20, sensor_msgs::PointField::FLOAT32, 4);
+    for (const MountedCamera& mounted : cameras_) {
+      addField("edge_px_" + mounted.name, offset, sensor_msgs::PointField::FLOAT32, 4);
+    }
+    const std::uint32_t flags_at = offset;
+    addField("catchable", flags_at, sensor_msgs::PointField::UINT16, 2);
+    addField("silhouette", flags_at + 2, sensor_msgs::PointField::UINT16, 2);
+    addField("apart", flags_at + 4, sensor_msgs::PointField::UINT16, 2);
+    message.height = 1;
+    message.width = static_cast<std::uint32_t>(scan.cloud.size());
+    message.point_step = offset;
+    message.row_step = message.point_step * message.width;
+    message.is_dense = 1;
+    message.data.assign(message.row_step, 0);
+    for (std::size_t i = 0; i < scan.cloud.size(); ++i) {
+      const Echo& echo = scan.simulated.echoes[i];
+      std::uint8_t* point = &message.data[i * message.point_step];
+      const float xyz[3] = {scan.cloud.x[i], scan.cloud.y[i], scan.cloud.z[i]};
+      std::memcpy(point, xyz, 12);
+      point[12] = static_cast<std::uint8_t>(echo.kind);
+      std::memcpy(point + 14, &scan.visible[i], 2);
+      std::memcpy(point + 16, &echo.surface, 4);
+      const float* edges = &scan.edge_px[i * cameras_.size()];
+      float least = -1.0F;
+      for (std::size_t c = 0; c < cameras_.size(); ++c) {
+        if (edges[c] >= 0.0F && (least < 0.0F || edges[c] < least)) least = edges[c];
+      }
+      std::memcpy(point + 20, &least, 4);
+      std::memcpy(point + 24, edges, 4 * cameras_.size());
+      std::memcpy(point + flags_at, &scan.catchable[i], 2);
+      std::memcpy(point + flags_at + 2, &scan.silhouette[i], 2);
+      std::memcpy(point + flags_at + 4, &scan.apart[i], 2);
+    }
+    return message;
+  }
+
+  void renderImages(StampNs stamp, Bag* bag) {
+    const double time = toSeconds(stamp - kStartNs);
+    world_.setInstant(time);
+    const Transform T_world_base = path_.pose(time);
+    const auto found = used_.find(stamp);
+    for (std::size_t c = 0; c < cameras_.size(); ++c) {
+      const Camera& camera = cameras_[c].camera;
+      const bool used = found != used_.end() && found->second.count(static_cast<int>(c)) != 0;
+      if (!used && !options_.all_images) continue;
+      const std::uint64_t key = mixKeys(options_.seed, static_cast<std::uint64_t>(stamp), c);
+      const Picture picture = camera.render(world_, T_world_base, key, options_.threads);
+      const std_msgs::Header header = headerOf(stamp, camera.info().frame_id);
+      const std::string ns = "/gmsl/" + cameras_[c].name;
+      writeImage(picture, ns, stamp, header, bag);
+      if (!used) continue;
+      bag->write(ns + "/labels_truth", stamp, *imageMessage(picture.labels, header));
+      const cv::Mat scores =
+          options_.perfect_network
+              ? perfectScores(picture.labels)
+              : imitateNetwork(picture.labels,
+                               {kFullWidth / kScoreStride, kFullHeight / kScoreStride}, key);
+      bag->write(ns + "/scores", stamp + kScoreDelayNs, *imageMessage(scores, header));
+      savePicture(c, picture);
+      const cv::Mat edges = distanceToClassEdge(picture.labels);
+      for (const std::size_t scan : found->second.at(static_cast<int>(c))) {
+        lookForPoints(c, time, T_world_base, picture.labels, edges, &scans_[scan]);
+      }
+    }
+  }
+
+  void writeImage(const Picture& picture, const std::string& ns, StampNs stamp,
+                  const std_msgs::Header& header, Bag* bag) const {
+    if (options_.raw_images) {
+      bag->write(ns + "/image_color", stamp, *imageMessage(picture.image, header));
+      return;
+    }
+    sensor_msgs::CompressedImage message;
+    message.header = header;
+    message.format = "bgr8; jpeg compressed bgr8";
+    if (!cv::imencode(".jpg", picture.image, message.data,
+                      {cv::IMWRITE_JPEG_QUALITY, kJpegQuality})) {
+      throw Error("OpenCV cannot write JPEG");
+    }
+    bag->write(ns + "/image_color/compressed", stamp, message);
+  }
+
+  void savePicture(std::size_t c, const Picture& picture) {
+    if (options_.pictures.empty() || !saved_.insert(c).second) return;
+    const std::string name = options_.pictures + "/" + cameras_[c].name;
+    if (!cv::imwrite(name + ".png", picture.image) ||
+        !cv::imwrite(name + "_labels.png", picture.labels * 20)) {
+      throw Error(options_.pictures + ": pictures cannot be written");
+    }
+  }
+
+  /// Marks the points of a scan that the camera sees, by a ray to where each is now.
+  void lookForPoints(std::size_t c, double time, const Transform& T_world_base,
+                     const cv::Mat& labels, const cv::Mat& edges, Scan* scan) const {
+    const Camera& camera = cameras_[c].camera;
+    const Transform T_world_camera = T_world_base * camera.T_base_camera();
+    const Transform T_camera_world = T_world_camera.inverse();
+    const ReturnsAround returns(scan->simulated, path_, lidarPose(), kStartNs, time);
+    const auto mark = [c](std::uint16_t* bits, bool set) {
+      if (set) *bits = static_cast<std::uint16_t>(*bits | (1U << c));
+    };
+    for (std::size_t i = 0; i < scan->simulated.echoes.size(); ++i) {
+      const Echo& echo = scan->simulated.echoes[i];
+      const Eigen::Vector3d p_world = world_.toWorld(echo.object, echo.p_object, time);
+      const std::optional<Eigen::Vector2d> pixel = camera.model().project(T_camera_world * p_world);
+      if (!pixel || !inImage(pixel->x(), pixel->y(), camera.model().imageSize())) continue;
+      const PointView view =
+          viewPoint(world_, returns, T_world_camera.translation(), echo.object, p_world);
+      mark(&scan->visible[i], view.visible);
+      mark(&scan->catchable[i], view.catchable);
+      mark(&scan->apart[i], view.apart);
+      mark(&scan->silhouette[i], view.silhouette);
+      if (!view.visible) continue;
+      // Through a gap smaller than a pixel, the pixel's centre shows something else: an edge.
+      const int u = pixelIndex(pixel->x()), v = pixelIndex(pixel->y());
+      const bool shown = labels.at<std::uint8_t>(v, u) == static_cast<std::uint8_t>(echo.kind);
+      scan->edge_px[i * cameras_.size() + c] = shown ? edges.at<float>(v, u) : 0.0F;
+    }
+  }
+
+  const SimulationOptions& options_;
+  void (*checkpoint_)();
+  DrivePath path_;
+  std::vector<MountedCamera> cameras_;
+  Odometry odometry_;
+  World world_;
+  std::vector<Scan> scans_;
+  std::vector<StampNs> images_;
+  std::map<StampNs, std::map<int, std::vector<std::size_t>>> used_;  ///< by stamp and camera: scans
+  std::set<std::size_t> saved_;
+  int readings_ = 0;
+  std::size_t written_scans_ = 0;
+};
+
+}  // namespace
+
+void simulateDrive(const SimulationOptions& options, void (*checkpoint)()) {
+  Simulation(options, checkpoint).run();
+}
+
+}  // namespace simulator
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,61 @@
+// SPDX-License-Identifier: MIT
+#include "tools/simulate_drive/rig.h"
+
+#include <cmath>
+
+namespace semantic_lidar_fusion {
+namespace simulator {
+namespace {
+
+constexpr double kRadPerDeg = 3.14159265358979323846 / 180.0;
+
+struct Mount {
+  const char* name;
+  const char* frame;
+  double x, y, yaw_deg;
+};
+constexpr Mount kMounts[] = {{"A0", "gmsl_centre_link", 1.45, 0.0, 0.0},
+                             {"A1", "gmsl_left_link", 1.40, 0.25, 55.0},
+                             {"A2", "gmsl_right_link", 1.40, -0.25, -55.0},
+                             {"B0", "gmsl_left_side_link", 0.95, 0.55, 110.0},
+                             {"B1", "gmsl_right_side_link", 0.95, -0.55, -110.0}};
+constexpr double kLidarX = 1.2, kLidarZ = 1.37, kLidarPitchDeg = 7.0;
+
+}  // namespace
+
+Transform lidarPose() {
+  Transform T = Transform::Identity();
+  T.translation() = Eigen::Vector3d(kLidarX, 0.0, kLidarZ);
+  T.linear() =
+      Eigen::AngleAxisd(kLidarPitchDeg * kRadPerDeg, Eigen::Vector3d::UnitY()).toRotationMatrix();
+  return T;
+}
+
+std::vector<MountedCamera> makeCameras(double scale, double drop_m) {
+  Eigen::Matrix3d R_body_optical;
+  R_body_optical << 0, 0, 1, -1, 0, 0, 0, -1, 0;
+  std::vector<MountedCamera> cameras;
+  for (const Mount& mount : kMounts) {
+    CameraInfo info;
+    info.frame_id = mount.frame;
+    info.size = {static_cast<int>(std::lround(scale * kFullWidth)),
+                 static_cast<int>(std::lround(scale * kFullHeight))};
+    info.distortion_model = "equidistant";
+    info.d = {-0.070, -0.008, 0.004, -0.0015};
+    const double fx = 1166.0 * scale, fy = 1165.2 * scale;
+    const double cx = 961.3 * scale - 0.5, cy = 602.6 * scale - 0.5;
+    info.k = {fx, 0, cx, 0, fy, cy, 0, 0, 1};
+    info.r = {1, 0, 0, 0, 1, 0, 0, 0, 1};
+    info.p = {fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0};
+    Transform T = Transform::Identity();
+    T.translation() = Eigen::Vector3d(mount.x, mount.y, kLidarZ - drop_m);
+    T.linear() =
+        Eigen::AngleAxisd(mount.yaw_deg * kRadPerDeg, Eigen::Vector3d::UnitZ()).toRotationMatrix() *
+        R_body_optical;
+    cameras.push_back({mount.name, Camera(info, T)});
+  }
+  return cameras;
+}
+
+}  // namespace simulator
+}  // namespace semantic_lidar_fusion

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Bags, the clouds and poses in them, and what a replay leaves."""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Public data sets in their own folder layouts -> bags."""

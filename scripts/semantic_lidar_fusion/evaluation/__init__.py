@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Semantic clouds against a truth: metrics, tables, calibration."""

@@ -1,0 +1,526 @@
+# SPDX-License-Identifier: MIT
+"""Semantic clouds against truth: what evaluate.py does.
+
+Runs fuse_bag, pairs its clouds with the topic points_truth, and adds up the scores. Only points
+with status 0 (fused) are scored; the others are counted. The most likely class is taken before the
+classes are merged to the rows of the table. True classes that the class set discards are left out; a
+discarded prediction is a miss, never a false positive.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+
+import numpy as np
+
+from semantic_lidar_fusion import cli
+from semantic_lidar_fusion.bags.bag_io import BagReader, to_ns
+from semantic_lidar_fusion.evaluation.calibration import Samples, Variant, fit_temperature
+from semantic_lidar_fusion.bags.cloud_io import SemanticCloud, require_fields, to_array, xyz
+from semantic_lidar_fusion.errors import ConfigError, DataError
+from semantic_lidar_fusion.labels import NO_LABEL, LabelSet, load_yaml
+from semantic_lidar_fusion.evaluation.metrics import Confusion, Reliability, Visibility
+
+TRUTH_TOPIC = "/points_truth"
+CLOUD_TOPIC = "/points_semantic"
+STATUS_NAMES = ("fused", "occluded", "outside", "no_image", "no_odometry")
+# A scan and its truth belong together if their stamps are not further apart, ns: less than the
+# period of any spinning lidar from one scan's stamp to the other end of the scan.
+MAX_STAMP_GAP_NS = 150 * 10**6
+# Motion during a scan changes a range by a metre or two; points in another order differ by more.
+MAX_RANGE_GAP_M = 2.0
+
+
+class Configuration(NamedTuple):
+    """A way to run fuse_bag: `settings` are KEY=VALUE overrides of the rig file."""
+
+    name: str
+    settings: Tuple[str, ...]
+
+
+class Rig:
+    """What the evaluation needs of a rig file (which fuse_bag checks), with its overrides."""
+
+    def __init__(self, path: str, overrides: Sequence[str] = ()):
+        tree = load_yaml(path)
+        if not isinstance(tree, dict):
+            raise ConfigError("%s: must be a mapping" % path)
+        self.path = path
+        self._tree = tree
+        self._overrides = _overrides(overrides)
+        classes = tree.get("classes")
+        if isinstance(classes, dict) and "file" in classes:
+            file = os.path.join(os.path.dirname(os.path.abspath(path)), str(classes["file"]))
+            self.labels = LabelSet.from_file(file)
+        else:
+            self.labels = LabelSet.from_tree(classes, path + ": classes")
+
+    def value(self, section: str, key: str, default: Any) -> Any:
+        """section.key, or the key of the top level if `section` is empty."""
+        name = section + "." + key if section else key
+        if name in self._overrides:
+            return self._overrides[name]
+        tree = self._tree.get(section) if section else self._tree
+        return tree.get(key, default) if isinstance(tree, dict) else default
+
+    @property
+    def cameras(self) -> List[Dict[str, Any]]:
+        """The entries of `cameras`, in the order of their bits."""
+        cameras = self._tree.get("cameras") or []
+        return [c for c in cameras if isinstance(c, dict) and "name" in c]
+
+    def configurations(self) -> List[Configuration]:
+        """The columns of Table I: direct, motion, motion_mask; without motion (or mask) in the rig
+        file only those that differ."""
+        moving = bool(self.value("motion", "enabled", True))
+        masked = _text(self.value("occlusion", "mode", "adaptive")) != "off"
+        still, open_view = "motion.enabled=false", "occlusion.mode=off"
+        result = [Configuration("direct", (still, open_view))]
+        if moving:
+            result.append(Configuration("motion", (open_view,)))
+        if masked:
+            result.append(Configuration("motion_mask" if moving else "mask", ()))
+        return result
+
+
+# The masks that evaluate.py --masks compares; the paper's has no angle but the one it is told.
+MASKS = (
+    Configuration("adaptive", ("occlusion.mode=adaptive",)),
+    Configuration(
+        "paper, 0.1 deg",
+        (
+            "occlusion.mode=paper",
+            "occlusion.vertical_step_deg=2",
+            "occlusion.horizontal_step_deg=0.1",
+        ),
+    ),
+    Configuration(
+        "paper, 0.2 deg",
+        (
+            "occlusion.mode=paper",
+            "occlusion.vertical_step_deg=2",
+            "occlusion.horizontal_step_deg=0.2",
+        ),
+    ),
+)
+
+
+def _text(value: Any) -> str:
+    return "off" if value is False else str(value)  # YAML 1.1 reads a bare off as false
+
+
+def _overrides(settings: Sequence[str]) -> Dict[str, Any]:
+    import yaml
+
+    result = {}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        if not equals or not key:
+            raise ConfigError("--set %s: must be KEY=VALUE" % setting)
+        result[key] = yaml.safe_load(value)
+    return result
+
+
+def find_fuse_bag(given: Optional[str] = None) -> str:
+    """The program: as given, from the folder SLF_BIN_DIR, beside the script, on the PATH, or where
+    catkin has put it."""
+    if given:
+        if not os.access(given, os.X_OK) or os.path.isdir(given):
+            raise ConfigError("--fuse-bag %s: not a program" % given)
+        return os.path.abspath(given)
+    folders = [os.environ.get("SLF_BIN_DIR", ""), os.path.dirname(os.path.abspath(sys.argv[0]))]
+    for folder in folders:
+        path = os.path.join(folder, "fuse_bag")
+        if folder and os.access(path, os.X_OK):
+            return path
+    on_path = shutil.which("fuse_bag")
+    if on_path:
+        return on_path
+    if shutil.which("catkin_find"):
+        found = subprocess.run(
+            ["catkin_find", "--first-only", "--libexec", "semantic_lidar_fusion", "fuse_bag"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            universal_newlines=True,
+        )
+        path = found.stdout.strip()
+        if path and os.access(path, os.X_OK):
+            return path
+    raise ConfigError(
+        "fuse_bag: not found beside this script, on the PATH, or by catkin_find; build the package "
+        "and source its setup.bash, or name the program with --fuse-bag"
+    )
+
+
+def run_fuse_bag(
+    program: str, bag: str, target: str, rig: str, settings: Sequence[str], all_topics: bool = False
+) -> None:
+    """Fuses a bag; DataError with the program's own words if it fails."""
+    command = [program, bag, target, "--rig", rig, "--force"]
+    command += [] if sys.stderr.isatty() else ["--quiet"]
+    command += ["--all"] if all_topics else []
+    for setting in settings:
+        command += ["--set", setting]
+    result = subprocess.run(command, stderr=subprocess.PIPE, universal_newlines=True)
+    for line in result.stderr.splitlines():
+        if result.returncode == 0 and "warn" in line.lower():
+            print(line, file=sys.stderr)
+    if result.returncode != 0:
+        lines = [line for line in result.stderr.splitlines() if line.strip()]
+        raise DataError("fuse_bag failed: %s" % " / ".join(lines[-3:] or ["no message"]))
+
+
+def class_set_of(path: str) -> LabelSet:
+    """The classes that a fused bag names in its topic class_info."""
+    with BagReader(path) as bag:
+        bag.require_topic("/class_info")
+        for item in bag.read(["/class_info"]):
+            try:
+                return LabelSet.from_class_info(json.loads(item.message.data))
+            except ValueError as error:
+                raise DataError("%s: class_info is not JSON (%s)" % (path, error)) from error
+    raise DataError("%s: class_info is empty" % path)
+
+
+class TruthScan(NamedTuple):
+    """One message of points_truth: label (N,) uint8 class ids; points (N,), the structured array."""
+
+    stamp_ns: int
+    points: np.ndarray
+
+    @property
+    def label(self) -> np.ndarray:
+        return self.points["label"]
+
+    def flags(self, name: str) -> Optional[np.ndarray]:
+        """(N,) uint16 of camera bits, or None if the bag has no such truth."""
+        if name not in self.points.dtype.names:
+            return None
+        return self.points[name].astype(np.uint16)
+
+
+class Truth:
+    """The truth of a bag, scan by scan."""
+
+    def __init__(self, path: str, class_count: int, topic: str = TRUTH_TOPIC, offset_ns: int = 0):
+        self.path, self.topic = path, topic
+        self._classes, self._offset_ns = class_count, offset_ns
+        with BagReader(path) as bag:
+            bag.require_topic(topic, "sensor_msgs/PointCloud2")
+            self.stamps_ns = [
+                to_ns(item.message.header.stamp) + offset_ns for item in bag.read([topic])
+            ]
+        if not self.stamps_ns:
+            raise DataError("%s: %s is empty" % (path, topic))
+
+    def scans(self) -> Iterator[TruthScan]:
+        with BagReader(self.path) as bag:
+            for item in bag.read([self.topic]):
+                points = to_array(item.message)
+                what = "%s %s" % (self.path, self.topic)
+                require_fields(points, ("x", "y", "z", "label"), what)
+                if points["label"].dtype != np.uint8:
+                    raise DataError(
+                        "%s: label is %s; must be uint8" % (what, points["label"].dtype)
+                    )
+                wrong = (points["label"] >= self._classes) & (points["label"] != NO_LABEL)
+                if wrong.any():
+                    raise DataError(
+                        "%s: label %d; must be below the %d classes, or 255"
+                        % (what, points["label"][wrong][0], self._classes)
+                    )
+                finite = np.isfinite(xyz(points)).all(axis=1)
+                yield TruthScan(
+                    to_ns(item.message.header.stamp) + self._offset_ns,
+                    points if finite.all() else points[finite],
+                )
+
+
+def pair_scans(truth_ns: Sequence[int], cloud_ns: Sequence[int]) -> List[int]:
+    """For each cloud (time of its first point) its truth's index, -1 = none.
+
+    As many of one as of the other go in order; else each truth to the nearest cloud, if that is
+    nearer than MAX_STAMP_GAP_NS."""
+    if len(truth_ns) == len(cloud_ns):
+        gaps = np.abs(np.array(truth_ns, dtype=np.int64) - np.array(cloud_ns, dtype=np.int64))
+        if len(gaps) and gaps.max() <= MAX_STAMP_GAP_NS:
+            return list(range(len(cloud_ns)))
+    result = [-1] * len(cloud_ns)
+    for cloud, stamp in enumerate(cloud_ns):
+        nearest = int(np.argmin([abs(stamp - other) for other in truth_ns]))
+        if abs(stamp - truth_ns[nearest]) > MAX_STAMP_GAP_NS:
+            continue
+        rival = int(np.argmin([abs(truth_ns[nearest] - other) for other in cloud_ns]))
+        if rival == cloud:
+            result[cloud] = nearest
+    return result
+
+
+class FusedBag:
+    """The semantic clouds of a bag that fuse_bag has written."""
+
+    def __init__(self, path: str, names: Sequence[str]):
+        self.path, self._names = path, list(names)
+        with BagReader(path) as bag:
+            bag.require_topic(CLOUD_TOPIC, "sensor_msgs/PointCloud2")
+            first = {
+                to_ns(item.message.time_ref): to_ns(item.message.header.stamp)
+                for item in bag.read(["/scan_reference"])
+            }
+            stamps = [to_ns(item.message.header.stamp) for item in bag.read([CLOUD_TOPIC])]
+        self.first_ns = [first.get(stamp, stamp) for stamp in stamps]
+        if not stamps:
+            raise DataError("%s: %s is empty" % (path, CLOUD_TOPIC))
+
+    def clouds(self, label: Optional[str] = None) -> Iterator[SemanticCloud]:
+        with BagReader(self.path) as bag:
+            for item in bag.read([CLOUD_TOPIC], label=label):
+                cloud = SemanticCloud.from_message(item.message)
+                if cloud.class_names != self._names:
+                    raise DataError(
+                        "%s: its classes are %s; the class set has %s"
+                        % (self.path, ", ".join(cloud.class_names), ", ".join(self._names))
+                    )
+                yield cloud
+
+
+def paired(
+    truth: Truth, fused: FusedBag, label: Optional[str] = None
+) -> Iterator[Tuple[int, SemanticCloud, TruthScan]]:
+    """(index of the truth, cloud, truth) of all scans that have both, in order of time.
+
+    DataError if there are none, or if the points of a pair are not the same."""
+    pairs = pair_scans(truth.stamps_ns, fused.first_ns)
+    if max(pairs) < 0:
+        raise DataError(
+            "%s and %s %s: no scan within %.2f s of its truth"
+            % (fused.path, truth.path, truth.topic, MAX_STAMP_GAP_NS * 1e-9)
+        )
+    scans = enumerate(truth.scans())
+    for number, cloud in zip(pairs, fused.clouds(label)):
+        if number < 0:
+            continue
+        index, scan = next(((i, s) for i, s in scans if i == number), (-1, None))
+        if scan is None:
+            raise DataError("%s: the stamps of %s are not in order" % (truth.path, truth.topic))
+        where = "%s: scan %d" % (fused.path, index)
+        if len(scan.points) != len(cloud):
+            raise DataError(
+                "%s has %d points, its truth %d; both must hold the same points (set "
+                "keep_unlabelled: true, and no range limits)"
+                % (where, len(cloud), len(scan.points))
+            )
+        if len(cloud):
+            ranges = np.linalg.norm(cloud.xyz, axis=1) - np.linalg.norm(xyz(scan.points), axis=1)
+            if np.median(np.abs(ranges)) > MAX_RANGE_GAP_M:
+                raise DataError(
+                    "%s: its points are not those of its truth, or in another order (ranges "
+                    "differ by %.1f m in the median)" % (where, np.median(np.abs(ranges)))
+                )
+        yield index, cloud, scan
+
+
+class Score:
+    """Everything that is counted for one configuration."""
+
+    def __init__(self, name: str, labels: LabelSet, min_edge_px: float = 0.0):
+        self.name, self.labels = name, labels
+        self.rows = [row.name for row in labels.evaluation_classes()]
+        if not self.rows:
+            raise ConfigError("the class set leaves no class to evaluate")
+        self.confusion = Confusion(len(self.rows))
+        self.reliability = Reliability()
+        self.status = np.zeros(len(STATUS_NAMES), dtype=np.int64)
+        self.scans = 0
+        self.without_truth = 0  # fused points whose truth is none or discarded
+        self._lookup, self._merge = labels.merge_lookup(), labels.merge_matrix()
+        self._min_edge_px = min_edge_px
+
+    def select(self, cloud: SemanticCloud, scan: TruthScan) -> np.ndarray:
+        """(N,) bool: points to score."""
+        chosen = cloud.fused.copy()
+        if self._min_edge_px > 0:
+            require_fields(scan.points, ("edge_px",), "truth (for --min-edge-px)")
+            chosen &= scan.points["edge_px"] > self._min_edge_px
+            cameras, visible = cloud.optional("cameras"), scan.flags("visible")
+            if cameras is not None and visible is not None:
+                chosen &= (cameras & ~visible) == 0
+        return chosen
+
+    def add(self, cloud: SemanticCloud, scan: TruthScan) -> None:
+        self.scans += 1
+        self.status += np.bincount(
+            np.minimum(cloud.status, len(STATUS_NAMES) - 1), minlength=len(STATUS_NAMES)
+        )
+        chosen = self.select(cloud, scan)
+        label = cloud.label[chosen]
+        if (label >= len(self.labels)).any():
+            raise DataError("scan %d: a fused point without a class" % (self.scans - 1))
+        truth, predicted = self._lookup[scan.label[chosen]], self._lookup[label]
+        distribution = cloud.probabilities[chosen].astype(np.float64)
+        merged = distribution @ self._merge
+        index = np.arange(len(label))
+        confidence = np.where(
+            predicted == NO_LABEL,
+            distribution[index, label],
+            merged[index, np.minimum(predicted, len(self.rows) - 1)],
+        )
+        self.without_truth += int((truth == NO_LABEL).sum())
+        self.confusion.add(truth, predicted)
+        self.reliability.add(merged, truth, predicted, confidence)
+
+    def merge(self, other: "Score") -> None:
+        """Adds another drive's counts."""
+        self.confusion.merge(other.confusion)
+        self.reliability.merge(other.reliability)
+        self.status += other.status
+        self.scans += other.scans
+        self.without_truth += other.without_truth
+
+    @property
+    def points(self) -> int:
+        return int(self.status.sum())
+
+    @property
+    def labelled(self) -> int:
+        """Points that carry a class."""
+        return int(self.status[0])
+
+
+def score_bag(
+    configuration: str,
+    fused: FusedBag,
+    truth: Truth,
+    labels: LabelSet,
+    min_edge_px: float = 0.0,
+    parity: Optional[int] = None,
+) -> Score:
+    """Scores a fused bag. `parity`: only scans whose number in the truth is even (0) or odd (1)."""
+    score = Score(configuration, labels, min_edge_px)
+    for index, cloud, scan in paired(truth, fused, configuration):
+        if parity is None or index % 2 == parity:
+            score.add(cloud, scan)
+    return score
+
+
+def mask_visibility(
+    unmasked: FusedBag, masked: FusedBag, truth: Truth, into: Optional[Visibility] = None
+) -> Optional[Visibility]:
+    """What the mask catches and loses, of two runs that differ in the mask alone, added to `into`;
+    None if the bag has no truth about visibility."""
+    result = Visibility() if into is None else into
+    for first, second in zip(paired(truth, unmasked), paired(truth, masked)):
+        (index, cloud, scan), (other, with_mask, _) = first, second
+        visible = scan.flags("visible")
+        if visible is None:
+            return None
+        cameras = [c.optional("cameras") for c in (cloud, with_mask)]
+        if index != other or any(bits is None for bits in cameras):
+            raise DataError(
+                "%s and %s: not the same scans, or no field cameras" % (unmasked.path, masked.path)
+            )
+        truths = (scan.flags(name) for name in ("catchable", "silhouette", "apart"))
+        result.add(cameras[0], cameras[1], visible, *truths)
+    return result
+
+
+def compare_clouds(offline: FusedBag, live: FusedBag) -> Tuple[int, int, int]:
+    """Scans that both bags have, those whose clouds are equal byte for byte, scans of `offline`."""
+
+    def contents(fused: FusedBag) -> Dict[int, bytes]:
+        with BagReader(fused.path) as bag:
+            return {
+                to_ns(item.message.header.stamp): bytes(item.message.data)
+                for item in bag.read([CLOUD_TOPIC])
+            }
+
+    wanted, got = contents(offline), contents(live)
+    both = [stamp for stamp in wanted if stamp in got]
+    return len(both), sum(wanted[stamp] == got[stamp] for stamp in both), len(wanted)
+
+
+def samples_of(
+    fused: FusedBag, truth: Truth, labels: LabelSet, parity: Optional[int]
+) -> Tuple[np.ndarray, np.ndarray]:
+    """Distributions and true rows to fit to: of points that a single camera saw."""
+    samples = Samples()
+    lookup = labels.merge_lookup()
+    for index, cloud, scan in paired(truth, fused):
+        if parity is not None and index % 2 != parity:
+            continue
+        cameras = cloud.optional("cameras")
+        chosen = cloud.fused.copy()
+        if cameras is not None:
+            chosen &= (cameras & (cameras - 1)) == 0
+        samples.add(cloud.probabilities[chosen], lookup[scan.label[chosen]])
+    return samples.arrays()
+
+
+class CalibrationCase(NamedTuple):
+    """A bag with its rig and truth, to fit to or to report on."""
+
+    bag: str
+    rig: Rig
+    truth: Truth
+    parity: Optional[int]
+
+
+def compare_temperatures(
+    program: str,
+    fit: CalibrationCase,
+    report: CalibrationCase,
+    settings: Sequence[str],
+    folder: str,
+) -> List[Tuple[Variant, Score]]:
+    """The raw softmax, the paper's share temperature, a fitted constant, and both combined.
+
+    The constants are fitted to the points of `fit` and all four run on `report`, whole. `folder`
+    takes the bags."""
+    labels = report.rig.labels
+    exponent = float(report.rig.value("uncertainty", "exponent", 2.0)) or 2.0
+
+    def fused(case: CalibrationCase, variant: Variant) -> FusedBag:
+        target = os.path.join(folder, "temperature.bag")
+        wanted = [
+            "uncertainty.temperature=%.6g" % variant.temperature,
+            "uncertainty.exponent=%.6g" % variant.exponent,
+        ]
+        run_fuse_bag(program, case.bag, target, case.rig.path, list(settings) + wanted)
+        return FusedBag(target, labels.names)
+
+    same = fit.bag == report.bag
+    result: List[Tuple[Variant, Score]] = []
+    fitted: List[Tuple[Variant, Score]] = []
+    for base, constant in (
+        (Variant("raw", 1.0, 0.0), "constant"),
+        (Variant("share", 1.0, exponent), "combined"),
+    ):
+        bag = fused(report, base)
+        result.append((base, score_bag(base.name, bag, report.truth, labels, 0.0, report.parity)))
+        source = bag if same else fused(fit, base)
+        probabilities, truth = samples_of(source, fit.truth, labels, fit.parity)
+        temperature = fit_temperature(probabilities, truth, labels.merge_matrix())
+        variant = Variant(constant, float("%.4g" % temperature), base.exponent)
+        bag = fused(report, variant)
+        fitted.append(
+            (variant, score_bag(variant.name, bag, report.truth, labels, 0.0, report.parity))
+        )
+    os.remove(os.path.join(folder, "temperature.bag"))
+    return result + fitted
+
+
+def required_settings(rig: Rig) -> List[str]:
+    """Overrides without which clouds and truth would not hold the same points."""
+    result = []
+    if rig.value("", "keep_unlabelled", True) is not True:
+        result.append("keep_unlabelled=true")
+    if rig.value("odometry", "on_missing", "mark") == "drop":
+        result.append("odometry.on_missing=mark")
+    for key in ("min_range_m", "max_range_m"):
+        if rig.value("lidar", key, 0):
+            cli.warn("lidar.%s is set aside: the truth holds every point" % key)
+            result.append("lidar.%s=0" % key)
+    return result

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: MIT
+"""The evaluation's results as Markdown and CSV."""
+
+import csv
+import io
+import math
+from typing import Any, List, Optional, Sequence, Tuple
+
+from semantic_lidar_fusion.evaluation.calibration import Variant
+from semantic_lidar_fusion.evaluation.scoring import STATUS_NAMES, Score
+from semantic_lidar_fusion.evaluation.metrics import Visibility, ratio
+from semantic_lidar_fusion.figures.plotting import title_of
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A value for a table; "-" where there is none."""
+    return "-" if math.isnan(value) else "%.*f" % (digits, value)
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A table whose columns line up in plain text; all but the first are right-aligned."""
+    cells = [[str(cell) for cell in row] for row in [header] + list(rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    lines = []
+    for row in cells:
+        padded = [row[0].ljust(widths[0])]
+        padded += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:])]
+        lines.append("| " + " | ".join(padded) + " |")
+    rule = [":" + "-" * (widths[0] - 1)] + ["-" * (width - 1) + ":" for width in widths[1:]]
+    lines.insert(1, "| " + " | ".join(rule) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def csv_text(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A CSV; floats with six digits, NaN as an empty cell."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        writer.writerow([_cell(value) for value in row])
+    return stream.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else "%.6f" % value
+    return value
+
+
+def table_one(scores: Sequence[Score]) -> str:
+    """The paper's Table I: recall, precision and F1 of each class for each configuration.
+
+    Classes that neither the truth nor any prediction has are only named below it."""
+    header = ["class"]
+    for score in scores:
+        header += ["%s: %s" % (score.name, what) for what in ("recall", "precision", "F1")]
+    shown = present_rows(scores)
+    rows = []
+    for index in shown:
+        row = [title_of(scores[0].rows[index])]
+        for score in scores:
+            confusion = score.confusion
+            for values in (confusion.recall, confusion.precision, confusion.f1):
+                row.append(number(float(values[index])))
+        rows.append(row + [str(int(scores[-1].confusion.support[index]))])
+    text = markdown(header + ["points"], rows)
+    absent = [name for index, name in enumerate(scores[0].rows) if index not in shown]
+    if absent:
+        text += "\nNeither in the truth nor predicted: %s.\n" % ", ".join(absent)
+    return text
+
+
+def present_rows(scores: Sequence[Score]) -> List[int]:
+    """Rows that the truth or a prediction of any configuration has."""
+    count = sum(s.confusion.support + s.confusion.matrix[:, :-1].sum(axis=0) for s in scores)
+    return [index for index, points in enumerate(count) if points > 0]
+
+
+def table_one_csv(scores: Sequence[Score]) -> str:
+    rows = []
+    for score in scores:
+        confusion = score.confusion
+        for index, name in enumerate(score.rows):
+            values = [confusion.recall, confusion.precision, confusion.f1]
+            rows.append(
+                [name, score.name]
+                + [float(value[index]) for value in values]
+                + [int(confusion.support[index])]
+            )
+    header = ["class", "configuration", "recall", "precision", "f1", "points"]
+    return csv_text(header, rows)
+
+
+def confusion_csv(score: Score) -> str:
+    """Counts; rows are the truth, columns the prediction."""
+    rows = [[name] + counts.tolist() for name, counts in zip(score.rows, score.confusion.matrix)]
+    return csv_text(["truth"] + score.rows + ["(discarded)"], rows)
+
+
+_SUMMARY = (
+    ["configuration", "scans", "points", "labelled", "removed_by_mask"]
+    + list(STATUS_NAMES[1:])
+    + ["without_truth", "scored", "accuracy", "nll", "brier", "ece"]
+)
+
+
+def mask_pair(names: Sequence[str]) -> Optional[Tuple[int, int]]:
+    """The runs that differ in the mask alone: the last one named for it, and the one before."""
+    masked = [index for index, name in enumerate(names) if index and "mask" in name]
+    return (masked[-1] - 1, masked[-1]) if masked else None
+
+
+def _summary_rows(scores: Sequence[Score]) -> List[List[Any]]:
+    pair = mask_pair([score.name for score in scores])
+    rows: List[List[Any]] = []
+    for index, score in enumerate(scores):
+        removed = float("nan")
+        if pair is not None and index == pair[1]:
+            before = scores[pair[0]].labelled
+            removed = float(ratio(before - score.labelled, before))
+        rows.append(
+            [score.name, score.scans, score.points, score.labelled, removed]
+            + [int(count) for count in score.status[1:]]
+            + [score.without_truth, score.confusion.total, score.confusion.accuracy]
+            + [score.reliability.nll, score.reliability.brier, score.reliability.ece]
+        )
+    return rows
+
+
+def summary(scores: Sequence[Score]) -> str:
+    """What happened to the points, and the scores over all classes; one column a configuration."""
+    rows = _summary_rows(scores)
+    lines = []
+    for index, name in enumerate(_SUMMARY[1:], 1):
+        cells = []
+        for row in rows:
+            value = row[index]
+            cells.append(number(value, 4) if isinstance(value, float) else str(value))
+        lines.append([name.replace("_", " ")] + cells)
+    return markdown([""] + [score.name for score in scores], lines)
+
+
+def summary_csv(scores: Sequence[Score]) -> str:
+    return csv_text(_SUMMARY, _summary_rows(scores))
+
+
+def visibility(rates: Visibility) -> str:
+    rows = [[what, points, number(share, 4)] for what, points, share in rates.rows()]
+    return markdown(["mask", "of points", "share"], rows)
+
+
+def visibility_csv(rates: Visibility) -> str:
+    return csv_text(["what", "points", "share"], rates.rows())
+
+
+def masks(results: Sequence[Tuple[str, str, Visibility]]) -> str:
+    """Rates of masks: (drive, mask, what it does) in rows."""
+    names = [row[0] for row in results[0][2].rows()]
+    rows = []
+    for drive, mask, rates in results:
+        cells = ["%s of %d" % (number(share, 4), points) for _, points, share in rates.rows()]
+        rows.append([drive, mask] + cells)
+    return markdown(["drive", "mask"] + names, rows)
+
+
+def masks_csv(results: Sequence[Tuple[str, str, Visibility]]) -> str:
+    rows = [[drive, mask] + row for drive, mask, rates in results for row in rates.rows()]
+    return csv_text(["drive", "mask", "what", "points", "share"], rows)
+
+
+def f1_by_drive(drives: Sequence[Tuple[str, Sequence[Score]]]) -> str:
+    """F1 of each class on each drive, from the first configuration to the last."""
+    shown = sorted({index for _, scores in drives for index in present_rows(scores)})
+    rows = []
+    for index in shown:
+        row = [title_of(drives[0][1][0].rows[index])]
+        for _, scores in drives:
+            row.append(", ".join(number(float(s.confusion.f1[index])) for s in scores))
+        rows.append(row)
+    return markdown(["F1"] + [name for name, _ in drives], rows)
+
+
+_TEMPERATURE = ["temperature", "exponent", "nll", "brier", "ece", "accuracy", "points"]
+
+
+def _temperature_row(variant: Variant, score: Score) -> List[Any]:
+    reliability = score.reliability
+    return [
+        variant.temperature,
+        variant.exponent,
+        reliability.nll,
+        reliability.brier,
+        reliability.ece,
+        score.confusion.accuracy,
+        reliability.total,
+    ]
+
+
+def temperatures(results: Sequence[Tuple[Variant, Score]]) -> str:
+    """The four temperatures against each other, on scans that none was fitted to."""
+    rows = []
+    for variant, score in results:
+        values = _temperature_row(variant, score)
+        cells = ["%.4g" % values[0], "%.4g" % values[1]]
+        rows.append([variant.name] + cells + [number(v, 4) for v in values[2:-1]] + [values[-1]])
+    return markdown(["tau"] + _TEMPERATURE, rows)
+
+
+def temperatures_csv(results: Sequence[Tuple[Variant, Score]]) -> str:
+    rows = [[variant.name] + _temperature_row(variant, score) for variant, score in results]
+    return csv_text(["tau"] + _TEMPERATURE, rows)

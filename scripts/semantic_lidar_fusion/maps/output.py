@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: MIT
+"""The folder of a map: made aside and renamed, so that it is there whole or not at all."""
+
+import os
+import shutil
+from typing import Any, Dict, List
+
+from semantic_lidar_fusion.errors import DataError, cannot_write
+from semantic_lidar_fusion.maps.export import ABOUT_FILE, FILES, MAP_FILE, Exporter
+from semantic_lidar_fusion.maps.map_file import MapReader
+from semantic_lidar_fusion.maps.raster import Costs
+
+
+class OutputFolder:
+    """A context manager: `partial` is the folder to fill; it becomes `path` when the block ends
+    without an error, and vanishes otherwise."""
+
+    def __init__(self, path: str, overwrite: bool):
+        self.path = os.path.abspath(path)
+        parent = os.path.dirname(self.path)
+        self.partial = os.path.join(
+            parent, ".%s.%d.partial" % (os.path.basename(self.path), os.getpid())
+        )
+        if os.path.lexists(self.path):
+            if not os.path.isdir(self.path):
+                raise DataError("%s: is a file, not a folder" % path)
+            names = os.listdir(self.path)
+            strange = sorted(set(names) - set(FILES))
+            if names and not overwrite:
+                raise DataError("%s: exists already; --overwrite replaces it" % path)
+            if strange:
+                raise DataError(
+                    "%s: is not replaced, for it holds %s, which is no map's" % (path, strange[0])
+                )
+        elif not os.path.isdir(parent):
+            raise DataError("%s: the folder %s does not exist" % (path, parent))
+
+    def __enter__(self) -> "OutputFolder":
+        try:
+            os.mkdir(self.partial)
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+        return self
+
+    def discard(self) -> None:
+        """Removes what is left of the partial folder: an interruption may come between making it
+        and entering the block."""
+        shutil.rmtree(self.partial, ignore_errors=True)
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        old = self.partial + ".old"
+        try:
+            if kind is None:
+                if os.path.isdir(self.path):
+                    os.rename(self.path, old)
+                try:
+                    os.rename(self.partial, self.path)
+                except OSError:
+                    if os.path.isdir(old):
+                        os.rename(old, self.path)
+                    raise
+        except OSError as rename_error:
+            raise cannot_write(self.path, rename_error) from rename_error
+        finally:
+            shutil.rmtree(old, ignore_errors=True)
+            self.discard()
+        if kind is not None and issubclass(kind, OSError):
+            raise cannot_write(self.path, error) from error
+
+
+def export_map(
+    folder: str, formats: List[str], costs: Costs, title: str, facts: Dict[str, Any]
+) -> Dict[str, int]:
+    """Exports MAP_FILE of a folder beside it; numbers of voxels of each layer."""
+    exporter = Exporter(MapReader(os.path.join(folder, MAP_FILE)), folder, costs)
+    exporter.write(formats, title, facts)
+    static, dynamic = exporter.extent.counts
+    return {"static": static, "dynamic": dynamic}
+
+
+def written_files(folder: str) -> List[str]:
+    """Names of a map's files in a folder, the map file first."""
+    names = [name for name in FILES if os.path.exists(os.path.join(folder, name))]
+    return sorted(names, key=lambda name: (name not in (MAP_FILE, ABOUT_FILE), name))
