@@ -3,6 +3,7 @@
 
 #include <Eigen/Core>
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 
@@ -57,14 +58,14 @@ void append(const Eigen::Vector3d& p_camera, const CameraModel& camera, std::uin
 class FastEquidistant {
  public:
   FastEquidistant(const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>& image_from_lidar,
-                  const CameraModel& camera, const Bounds& bounds) {
+                  const CameraModel& camera, const std::array<double, 4>& k, const Bounds& bounds) {
     std::copy_n(image_from_lidar.data(), 12, lens_.matrix);
     lens_.focal_x = static_cast<float>(camera.fx());
     lens_.focal_y = static_cast<float>(camera.fy());
     lens_.skew = static_cast<float>(camera.skew());
     lens_.centre_x = static_cast<float>(camera.cx());
     lens_.centre_y = static_cast<float>(camera.cy());
-    for (std::size_t i = 0; i < 4; ++i) lens_.k[i] = static_cast<float>(camera.coefficients()[i]);
+    for (std::size_t i = 0; i < 4; ++i) lens_.k[i] = static_cast<float>(k[i]);
     lens_.theta_sure = static_cast<float>(camera.maxThetaRad() - kThetaSlack_rad);
     lens_.theta_never = static_cast<float>(camera.maxThetaRad() + kThetaSlack_rad);
     lens_.u_begin = lens_.v_begin = static_cast<float>(bounds.begin);
@@ -127,10 +128,10 @@ ProjectedPoints projectCloud(const Cloud& cloud, const Transform& T_camera_lidar
                       camera.imageSize().height - 0.5 + margin_px};
   const auto image_from_lidar = imageFromLidar(T_camera_lidar, camera);
   const SightCone cone = sightCone(image_from_lidar, camera.maxThetaWithin(margin_px));
-  const bool fast = camera.distortion() == DistortionModel::kEquidistant &&
-                    singlePrecisionSuffices(camera, bounds);
+  const std::array<double, 4>* k = camera.lens().kannalaBrandt();
+  const bool fast = k != nullptr && singlePrecisionSuffices(camera, bounds);
   std::optional<FastEquidistant> equidistant;
-  if (fast) equidistant.emplace(image_from_lidar, camera, bounds);
+  if (fast) equidistant.emplace(image_from_lidar, camera, *k, bounds);
 
   ProjectedPoints points;
   const std::size_t expected = cloud.size() / 3;

@@ -17,8 +17,8 @@ MaskSize paperMaskSize(const CameraModel& camera, double horizontal_step_rad,
     const int up = static_cast<int>(std::ceil(std::min(gap, 1e6)));
     return std::max(1, std::min(up | 1, 2 * static_cast<int>(std::floor(std::min(gap, 1e6))) - 1));
   };
-  return {odd(camera.fx() * std::tan(horizontal_step_rad)),
-          odd(camera.fy() * std::tan(vertical_step_rad))};
+  return {odd(camera.axialFocalX() * std::tan(horizontal_step_rad)),
+          odd(camera.axialFocalY() * std::tan(vertical_step_rad))};
 }
 
 double castMarginPx(const CameraModel& camera, const BeamGrid& grid,
@@ -28,7 +28,7 @@ double castMarginPx(const CameraModel& camera, const BeamGrid& grid,
   for (const BeamGrid::Ring& ring : grid.rings) {
     step = std::max({step, 2.0 * ring.half_up_rad, 2.0 * ring.half_down_rad});
   }
-  return std::max(camera.fx(), camera.fy()) * step;
+  return std::max(camera.axialFocalX(), camera.axialFocalY()) * step;
 }
 
 std::vector<std::uint8_t> visiblePoints(const Cloud& cloud, const ProjectedPoints& points,

@@ -94,7 +94,8 @@ class SurfaceMasks {
         margin_m_(static_cast<float>(config.depth_margin_m)),
         margin_ratio_(static_cast<float>(config.depth_margin_ratio)),
         tiles_(points, camera.imageSize(),
-               std::max(4.0f, static_cast<float>(0.5 * camera.fy() * grid.vertical_step_rad))),
+               std::max(4.0f,
+                        static_cast<float>(0.5 * camera.axialFocalY() * grid.vertical_step_rad))),
         slot_(cloud.size(), -1) {
     for (std::size_t i = 0; i < points.size(); ++i) {
       slot_[points.index[i]] = static_cast<std::int32_t>(i);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT
-/// Camera models of sensor_msgs/CameraInfo: pinhole, plumb_bob, rational_polynomial (Brown-Conrady
-/// with OpenCV's coefficients) and equidistant (Kannala-Brandt, paper eq. 6-11, valid beyond 90
-/// deg).
+/// The camera of a sensor_msgs/CameraInfo: a lens (see lens.h) before a sensor. Its lenses are
+/// pinhole, plumb_bob, rational_polynomial (Brown-Conrady with OpenCV's coefficients) and
+/// equidistant (Kannala-Brandt, paper eq. 6-11, valid beyond 90 deg).
 ///
 /// A point has a pixel only where the model is one-to-one: equidistant: theta = atan2(hypot(x, y),
 /// z) on the rising branch of theta_d; the others: z > 0, radius below the fold-over of the radial
@@ -16,11 +16,12 @@
 
 #include <Eigen/Core>
 #include <array>
-#include <cstdint>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
 
+#include "semantic_lidar_fusion/camera/lens.h"
 #include "semantic_lidar_fusion/common/types.h"
 
 namespace semantic_lidar_fusion {
@@ -47,15 +48,15 @@ struct CameraModelOptions {
   double max_theta_deg = 0.0;  ///< largest angle from the optical axis; 0 = no limit
 };
 
-enum class DistortionModel : std::uint8_t { kPinhole, kBrownConrady, kEquidistant };
-
 class CameraModel {
  public:
   /// Throws DataError naming field, value and rule: unknown model, wrong number of coefficients,
   /// non-finite or non-positive focal length, size 0, all-zero P when rectified, ROI outside, R not
   /// a rotation. plumb_bob has 0, 4 or 5 coefficients, rational_polynomial 8 (12 and 14 if the thin
-  /// prism and tilt terms are zero), equidistant 4.
-  CameraModel(const CameraInfo& info, const CameraModelOptions& options);
+  /// prism and tilt terms are zero), equidistant 4; further zeros are left out (see notes()).
+  /// `lenses`: those that it may have.
+  CameraModel(const CameraInfo& info, const CameraModelOptions& options,
+              const std::vector<LensKind>& lenses = lensKinds());
 
   /// Pixel of a point in the camera's frame; empty where the model has none. Pixels outside the
   /// image are returned too (see inImage).
@@ -63,6 +64,8 @@ class CameraModel {
   /// Unit ray of a pixel in the camera's frame, from opticalCentre(); empty where no ray maps to
   /// it.
   std::optional<Eigen::Vector3d> ray(const Eigen::Vector2d& pixel) const;
+  /// d (u, v) / d p_camera, px/m, where project() gives a pixel.
+  Matrix23d jacobian(const Eigen::Vector3d& p_camera) const;
   /// Angle between a point, seen from opticalCentre(), and the optical axis of the image, rad.
   double theta(const Eigen::Vector3d& p_camera) const;
   /// No point at a larger angle has a pixel within `margin_px` of the image; at most maxThetaRad().
@@ -71,34 +74,31 @@ class CameraModel {
   const Eigen::Vector3d& opticalCentre() const { return optical_centre_; }
 
   const ImageSize& imageSize() const { return size_; }  ///< after binning and ROI
-  DistortionModel distortion() const { return distortion_; }
+  const Lens& lens() const { return *lens_; }
   bool rectified() const { return rectified_; }
   double fx() const { return fx_; }  ///< px, after binning
   double fy() const { return fy_; }
   double cx() const { return cx_; }  ///< px, after binning and ROI
   double cy() const { return cy_; }
-  double skew() const { return skew_; }  ///< alpha = K[1] / fx; equidistant only
+  double skew() const { return skew_; }  ///< alpha = K[1] / fx; only of lenses that honour it
+  /// px/rad on the optical axis: fx and fy of most lenses.
+  double axialFocalX() const { return fx_ * lens_->axialScale(); }
+  double axialFocalY() const { return fy_ * lens_->axialScale(); }
   /// Largest valid angle from the axis: fold-over, pole or max_theta_deg, whichever is least.
-  double maxThetaRad() const { return max_theta_rad_; }
-  /// Brown-Conrady: always 8 in OpenCV's order (k1 k2 p1 p2 k3 k4 k5 k6); equidistant: 4.
-  const std::vector<double>& coefficients() const { return d_; }
+  double maxThetaRad() const { return lens_->maxThetaRad(); }
+  /// What was read against the letter of the camera_info, one sentence each; for users.
+  const std::vector<std::string>& notes() const { return notes_; }
   /// Rotation from the camera's frame to the axes in which K, D hold.
   const Eigen::Matrix3d& R_raw_camera() const { return R_raw_camera_; }
-  /// Brown-Conrady and pinhole: largest valid hypot(x, y) / z, infinite if there is no limit.
-  double maxRadius() const { return max_radius_; }
 
  private:
-  std::optional<Eigen::Vector3d> rawRay(double x_distorted, double y_distorted) const;
-
-  DistortionModel distortion_ = DistortionModel::kPinhole;
   bool rectified_ = false;
   ImageSize size_;
   double fx_ = 0, fy_ = 0, cx_ = 0, cy_ = 0, skew_ = 0;
   Eigen::Vector3d optical_centre_ = Eigen::Vector3d::Zero();
   Eigen::Matrix3d R_raw_camera_ = Eigen::Matrix3d::Identity();  ///< R^T (image_geometry's rule)
-  std::vector<double> d_;
-  double max_theta_rad_ = 0;
-  double max_radius_ = 0;
+  std::vector<std::string> notes_;
+  std::shared_ptr<const Lens> lens_;
 };
 
 }  // namespace semantic_lidar_fusion
