@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "base/parameters.h"
+#include "edge/version.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
@@ -126,11 +127,9 @@ void FusionNodelet::onInit() {
 }
 
 void FusionNodelet::publishConfiguration() {
-  const auto message = boost::make_shared<std_msgs::String>();
-  message->data = "version: " SLF_VERSION "\n" + rig_.yaml + "\n";
   configuration_ = getPrivateNodeHandle().advertise<std_msgs::String>("configuration", 1, true);
-  configuration_.publish(message);
-  health_.set("version", SLF_VERSION);
+  configuration_.publish(configurationMessage(rig_));
+  health_.set("version", kVersion);
 }
 
 void FusionNodelet::startTicking() {

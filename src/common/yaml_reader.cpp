@@ -266,6 +266,13 @@ std::string YamlSection::pathOf(const std::string& key) const {
   return path_.empty() ? key : path_ + "." + key;
 }
 
+YamlSection YamlSection::child(const std::string& key) {
+  YamlSection section(get(key), pathOf(key), problems_);
+  section.parent_ = this;
+  section.key_in_parent_ = key;
+  return section;
+}
+
 bool YamlSection::has(const std::string& key) const {
   return const_cast<const YAML::Node&>(node_)[key].IsDefined();
 }
@@ -285,42 +292,56 @@ void YamlSection::problem(const std::string& key, const std::string& rule) {
 }
 
 void YamlSection::number(const std::string& key, double* value, const NumberRange& range) {
-  if (!present(key)) return;
-  const std::optional<double> read = toNumber(node_[key]);
-  if (read && within(*read, range)) {
-    *value = *read;
-  } else {
-    problem(key, "must be " + ruleOf(range));
+  if (present(key)) {
+    const std::optional<double> read = toNumber(node_[key]);
+    if (read && within(*read, range)) {
+      *value = *read;
+    } else {
+      problem(key, "must be " + ruleOf(range));
+    }
   }
+  keep(key, YamlTree::number(*value));
 }
 
 void YamlSection::integer(const std::string& key, int* value, int least, int most) {
-  if (!present(key)) return;
-  const std::optional<double> read = toNumber(node_[key]);
-  if (read && *read >= least && *read <= most && std::floor(*read) == *read) {
-    *value = static_cast<int>(*read);
-  } else {
-    problem(key,
-            "must be a whole number from " + std::to_string(least) + " to " + std::to_string(most));
+  if (present(key)) {
+    const std::optional<double> read = toNumber(node_[key]);
+    if (read && *read >= least && *read <= most && std::floor(*read) == *read) {
+      *value = static_cast<int>(*read);
+    } else {
+      problem(key, "must be a whole number from " + std::to_string(least) + " to " +
+                       std::to_string(most));
+    }
   }
+  keep(key, YamlTree::integer(*value));
 }
 
 void YamlSection::boolean(const std::string& key, bool* value) {
-  if (!present(key)) return;
-  if (!YAML::convert<bool>::decode(node_[key], *value)) problem(key, "must be true or false");
+  if (present(key) && !YAML::convert<bool>::decode(node_[key], *value)) {
+    problem(key, "must be true or false");
+  }
+  keep(key, YamlTree::boolean(*value));
 }
 
 void YamlSection::text(const std::string& key, std::string* value) {
-  if (!present(key)) return;
-  if (node_[key].IsScalar()) {
-    *value = node_[key].Scalar();
-  } else {
-    problem(key, "must be a text");
+  if (present(key)) {
+    if (node_[key].IsScalar()) {
+      *value = node_[key].Scalar();
+    } else {
+      problem(key, "must be a text");
+    }
   }
+  keep(key, YamlTree::text(*value));
 }
 
 void YamlSection::texts(const std::string& key, std::vector<std::string>* values) {
-  if (!present(key)) return;
+  if (present(key)) readTexts(key, values);
+  YamlTree list = YamlTree::list();
+  for (const std::string& value : *values) list.add(YamlTree::text(value));
+  keep(key, std::move(list));
+}
+
+void YamlSection::readTexts(const std::string& key, std::vector<std::string>* values) {
   const YAML::Node list = node_[key];
   if (!list.IsSequence()) {
     problem(key, "must be a list of texts");
@@ -340,7 +361,14 @@ void YamlSection::texts(const std::string& key, std::vector<std::string>* values
 
 void YamlSection::numbers(const std::string& key, std::vector<double>* values,
                           const NumberRange& range) {
-  if (!present(key)) return;
+  if (present(key)) readNumbers(key, values, range);
+  YamlTree list = YamlTree::list();
+  for (const double value : *values) list.add(YamlTree::number(value));
+  keep(key, std::move(list));
+}
+
+void YamlSection::readNumbers(const std::string& key, std::vector<double>* values,
+                              const NumberRange& range) {
   const YAML::Node list = node_[key];
   if (!list.IsSequence()) {
     problem(key, "must be a list of numbers");
@@ -372,6 +400,7 @@ int YamlSection::indexOfChoice(const std::string& key, const std::vector<std::st
 }
 
 void YamlSection::finish() {
+  if (parent_ != nullptr) parent_->keep(key_in_parent_, resolved_);
   std::set<std::string> seen;
   for (const auto& item : node_) {
     if (!item.first.IsScalar()) {

@@ -59,6 +59,7 @@ void readFrame(YamlSection& section, const std::string& key, bool required, std:
   if (blank || (required && frame->empty())) {
     section.problem(key, "must be a tf frame, without blanks");
   }
+  section.keep(key, YamlTree::text(*frame));
 }
 
 std::string resolved(const std::string& path, const std::string& base_directory) {
@@ -81,6 +82,10 @@ void readPath(YamlSection& section, const std::string& key, const std::string& b
   if (path->empty()) return;
   *path = resolved(*path, base_directory);
   if (!isReadableFile(*path)) section.problem(key, unreadable(*path));
+  // What is kept must hold wherever it is read again.
+  std::error_code error;
+  const std::filesystem::path absolute = std::filesystem::absolute(*path, error);
+  if (!error) section.keep(key, YamlTree::text(absolute.lexically_normal().string()));
 }
 
 /// `key`: where `node` stands, "classes" or "classes.file".
@@ -113,8 +118,36 @@ LabelSet readClasses(const YAML::Node& node, const std::string& key,
              : LabelSet();
 }
 
+/// The set in place, as the key `classes` takes it.
+YamlTree classesTree(const LabelSet& set) {
+  const auto names = [&](const std::vector<int>& ids) {
+    YamlTree list = YamlTree::list();
+    for (const int id : ids) list.add(YamlTree::text(set[id].name));
+    return list;
+  };
+  YamlTree classes = YamlTree::list();
+  for (const ClassInfo& info : set.classes()) {
+    YamlTree color = YamlTree::list();
+    for (const std::uint8_t value : info.color_rgb) color.add(YamlTree::integer(value));
+    YamlTree entry = YamlTree::map();
+    entry.put("name", YamlTree::text(info.name));
+    entry.put("color", std::move(color));
+    entry.put("dynamic", YamlTree::boolean(info.dynamic));
+    classes.add(std::move(entry));
+  }
+  YamlTree merge = YamlTree::map();
+  for (const MergedClass& merged : set.merged()) merge.put(merged.name, names(merged.members));
+  YamlTree evaluation = YamlTree::map();
+  evaluation.put("discard", names(set.discarded()));
+  evaluation.put("merge", std::move(merge));
+  YamlTree tree = YamlTree::map();
+  tree.put("classes", std::move(classes));
+  tree.put("evaluation", std::move(evaluation));
+  return tree;
+}
+
 CameraConfig readCamera(const YAML::Node& node, std::size_t index,
-                        const std::string& base_directory, Problems* problems) {
+                        const std::string& base_directory, Problems* problems, YamlTree* list) {
   CameraConfig camera;
   std::string path = "cameras[" + std::to_string(index) + "]";
   // A camera's problems are named the way its overrides are.
@@ -154,6 +187,7 @@ CameraConfig readCamera(const YAML::Node& node, std::size_t index,
   section.number("timeout", &camera.timeout_s, kWait);
   section.number("reorder_window", &camera.reorder_window_s, {0, 1});
   section.finish();
+  list->add(section.resolved());
   return camera;
 }
 
@@ -163,7 +197,7 @@ std::string topicBelow(const std::string& ns, const std::string& name) {
 }
 
 std::vector<CameraConfig> readCameras(const YAML::Node& node, const std::string& base_directory,
-                                      Problems* problems) {
+                                      Problems* problems, YamlTree* list) {
   std::vector<CameraConfig> cameras;
   if (!node.IsDefined() || node.IsNull()) return cameras;
   if (!node.IsSequence()) {
@@ -176,7 +210,7 @@ std::vector<CameraConfig> readCameras(const YAML::Node& node, const std::string&
   }
   std::set<std::string> names, topics;
   for (std::size_t i = 0; i < node.size(); ++i) {
-    CameraConfig camera = readCamera(node[i], i, base_directory, problems);
+    CameraConfig camera = readCamera(node[i], i, base_directory, problems, list);
     const std::string path = "cameras[" + std::to_string(i) + "]";
     if (isCameraName(camera.name)) {
       const std::string topic = topicBelow(camera.ns, camera.image);
@@ -217,9 +251,8 @@ std::size_t laserCount(LidarModel model) {
   return model == LidarModel::kVlp16 || model == LidarModel::kPuckHiRes ? 16 : 32;
 }
 
-LidarConfig readLidar(const YAML::Node& node, Problems* problems) {
+LidarConfig readLidar(YamlSection section, const Problems* problems) {
   LidarConfig lidar;
-  YamlSection section(node, "lidar", problems);
   section.choice<LidarInput>("input", &lidar.input,
                              {{"packets", LidarInput::kPackets}, {"points", LidarInput::kPoints}});
   lidar.topic = lidar.input == LidarInput::kPackets ? "velodyne_packets" : "points";
@@ -268,9 +301,8 @@ LidarConfig readLidar(const YAML::Node& node, Problems* problems) {
   return lidar;
 }
 
-SuperpixelConfig readSuperpixels(const YAML::Node& node, Problems* problems) {
+SuperpixelConfig readSuperpixels(YamlSection section) {
   SuperpixelConfig superpixels;
-  YamlSection section(node, "superpixels", problems);
   section.integer("count", &superpixels.count, 1, 10000000);
   section.number("compactness", &superpixels.compactness, {0, 1e6, true});
   section.integer("iterations", &superpixels.iterations, 1, 100);
@@ -280,17 +312,15 @@ SuperpixelConfig readSuperpixels(const YAML::Node& node, Problems* problems) {
   return superpixels;
 }
 
-UncertaintyConfig readUncertainty(const YAML::Node& node, Problems* problems) {
+UncertaintyConfig readUncertainty(YamlSection section) {
   UncertaintyConfig uncertainty;
-  YamlSection section(node, "uncertainty", problems);
   section.number("temperature", &uncertainty.temperature, {0, 1e6, true});
   section.number("exponent", &uncertainty.exponent, {0, 100});
   section.finish();
   return uncertainty;
 }
 
-void readMotion(const YAML::Node& node, Rig* rig, Problems* problems) {
-  YamlSection section(node, "motion", problems);
+void readMotion(YamlSection section, Rig* rig) {
   section.boolean("enabled", &rig->motion_enabled);
   section.choice<MotionGranularity>(
       "granularity", &rig->motion_granularity,
@@ -298,9 +328,8 @@ void readMotion(const YAML::Node& node, Rig* rig, Problems* problems) {
   section.finish();
 }
 
-OdometryConfig readOdometry(const YAML::Node& node, Problems* problems) {
+OdometryConfig readOdometry(YamlSection section) {
   OdometryConfig odometry;
-  YamlSection section(node, "odometry", problems);
   section.choice<OdometrySource>("source", &odometry.source,
                                  {{"tf", OdometrySource::kTf}, {"topic", OdometrySource::kTopic}});
   readTopic(section, "topic", &odometry.topic);
@@ -319,11 +348,9 @@ OdometryConfig readOdometry(const YAML::Node& node, Problems* problems) {
   return odometry;
 }
 
-ReferenceConfig readReference(const YAML::Node& node, const std::vector<CameraConfig>& cameras,
-                              Problems* problems) {
+ReferenceConfig readReference(YamlSection section, const std::vector<CameraConfig>& cameras) {
   ReferenceConfig reference;
   if (!cameras.empty()) reference.camera = cameras.front().name;
-  YamlSection section(node, "reference", problems);
   section.choice<ReferenceChoice>("choose", &reference.choose,
                                   {{"closest_image", ReferenceChoice::kClosestImage},
                                    {"scan_start", ReferenceChoice::kScanStart},
@@ -332,6 +359,7 @@ ReferenceConfig readReference(const YAML::Node& node, const std::vector<CameraCo
   std::string name = reference.camera;
   section.text("camera", &name);
   if (!name.empty()) reference.camera = name;
+  section.keep("camera", YamlTree::text(reference.camera));
   std::vector<std::string> names;
   for (const CameraConfig& camera : cameras) names.push_back(camera.name);
   if (section.has("camera") && !name.empty() &&
@@ -345,10 +373,8 @@ ReferenceConfig readReference(const YAML::Node& node, const std::vector<CameraCo
   return reference;
 }
 
-SegmentationConfig readSegmentation(const YAML::Node& node, const std::string& base_directory,
-                                    Problems* problems) {
+SegmentationConfig readSegmentation(YamlSection section, const std::string& base_directory) {
   SegmentationConfig segmentation;
-  YamlSection section(node, "segmentation", problems);
   readPath(section, "model", base_directory, &segmentation.model);
   section.choice<SegmentationMode>("mode", &segmentation.mode,
                                    {{"on_request", SegmentationMode::kOnRequest},
@@ -361,9 +387,8 @@ SegmentationConfig readSegmentation(const YAML::Node& node, const std::string& b
   return segmentation;
 }
 
-OcclusionConfig readOcclusion(const YAML::Node& node, Problems* problems) {
+OcclusionConfig readOcclusion(YamlSection section) {
   OcclusionConfig occlusion;
-  YamlSection section(node, "occlusion", problems);
   // YAML 1.1 parsers, rosparam's among them, read a plain `off` as false.
   section.choice<OcclusionMode>("mode", &occlusion.mode,
                                 {{"off", OcclusionMode::kOff},
@@ -388,28 +413,31 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
   section.text("name", &rig.name);
 
   const YAML::Node classes = section.get("classes");
-  rig.cameras = readCameras(section.get("cameras"), base_directory, &own);
+  YamlTree cameras = YamlTree::list();
+  rig.cameras = readCameras(section.get("cameras"), base_directory, &own, &cameras);
   if (classes.IsDefined() && !classes.IsNull()) {
     rig.classes = readClasses(classes, "classes", base_directory, source_name, problems);
   } else if (!rig.cameras.empty()) {
     section.problem("classes", "must be {file: PATH} or a class set where there are cameras");
   }
-  rig.lidar = readLidar(section.get("lidar"), &own);
+  section.keep("classes", rig.classes.size() > 0 ? classesTree(rig.classes) : YamlTree());
+  section.keep("cameras", std::move(cameras));
+  rig.lidar = readLidar(section.child("lidar"), &own);
   readFrame(section, "fixed_frame", true, &rig.fixed_frame);
   readFrame(section, "vehicle_frame", true, &rig.vehicle_frame);
-  rig.superpixels = readSuperpixels(section.get("superpixels"), &own);
-  rig.uncertainty = readUncertainty(section.get("uncertainty"), &own);
-  readMotion(section.get("motion"), &rig, &own);
+  rig.superpixels = readSuperpixels(section.child("superpixels"));
+  rig.uncertainty = readUncertainty(section.child("uncertainty"));
+  readMotion(section.child("motion"), &rig);
   if (rig.motion_enabled && rig.fixed_frame == rig.vehicle_frame) {
     section.problem("vehicle_frame", "must differ from fixed_frame unless motion.enabled is false");
   }
-  rig.odometry = readOdometry(section.get("odometry"), &own);
-  rig.reference = readReference(section.get("reference"), rig.cameras, &own);
+  rig.odometry = readOdometry(section.child("odometry"));
+  rig.reference = readReference(section.child("reference"), rig.cameras);
   section.choice<ImageChoice>("image_choice", &rig.image_choice,
                               {{"closest_to_reference", ImageChoice::kClosestToReference},
                                {"closest_to_sweep", ImageChoice::kClosestToSweep}});
-  rig.segmentation = readSegmentation(section.get("segmentation"), base_directory, &own);
-  rig.occlusion = readOcclusion(section.get("occlusion"), &own);
+  rig.segmentation = readSegmentation(section.child("segmentation"), base_directory);
+  rig.occlusion = readOcclusion(section.child("occlusion"));
   section.choice<OverlapRule>("overlap", &rig.overlap,
                               {{"mean", OverlapRule::kMean},
                                {"product", OverlapRule::kProduct},
@@ -419,6 +447,7 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
   section.integer("threads", &rig.threads, 1, ThreadPool::kMaxThreads);
   section.finish();
   for (const std::string& problem : own) problems->push_back(source_name + ": " + problem);
+  rig.yaml = section.resolved().toYaml();
   return rig;
 }
 
@@ -554,7 +583,6 @@ Rig rigFromYaml(const YAML::Node& root, const std::string& base_directory,
   }
   Rig rig = readRig(tree, base_directory, source_name, &problems);
   if (!problems.empty()) throw ConfigError(std::move(problems));
-  rig.yaml = YAML::Dump(tree);
   return rig;
 }
 

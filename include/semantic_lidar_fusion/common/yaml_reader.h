@@ -14,6 +14,8 @@
 #include <utility>
 #include <vector>
 
+#include "semantic_lidar_fusion/common/yaml_writer.h"
+
 namespace semantic_lidar_fusion {
 
 /// The one document of a YAML text as a tree without anchors: bounded in size and depth, and free
@@ -39,12 +41,17 @@ struct NumberRange {
 };
 
 /// One map of a configuration. Every key that is asked for becomes a known key; `finish` reports
-/// the rest.
+/// the rest. What each key came to, given or by default, is kept in the order of asking, so that
+/// the settings can be written whole: no reader of a key can forget its writer.
 class YamlSection {
  public:
   /// `node` may be undefined or empty (no keys); anything but a map is a problem. `path` names the
   /// section in messages, empty for the root. Problems go to `problems`, which must outlive this.
   YamlSection(const YAML::Node& node, std::string path, std::vector<std::string>* problems);
+
+  /// The map below a key, which puts what its keys came to into `this` when it finishes; `this`
+  /// must then still be there.
+  YamlSection child(const std::string& key);
 
   bool has(const std::string& key) const;
   /// The value of a key, undefined if absent.
@@ -72,15 +79,24 @@ class YamlSection {
     }
     const int index = indexOfChoice(key, names, shown);
     if (index >= 0) *value = (options.begin() + index)->second;
+    const auto chosen = std::find_if(options.begin(), options.end(),
+                                     [&](const auto& option) { return option.second == *value; });
+    if (chosen != options.end()) keep(key, YamlTree::text(chosen->first));
   }
 
   /// Reports that the value of `key` breaks `rule` ("must be ...").
   void problem(const std::string& key, const std::string& rule);
+  /// Keeps what a key came to in the end, where that differs from what was read.
+  void keep(const std::string& key, YamlTree value) { resolved_.put(key, std::move(value)); }
+  /// What all keys came to.
+  const YamlTree& resolved() const { return resolved_; }
   /// Reports duplicate and unknown keys.
   void finish();
 
  private:
   bool present(const std::string& key);
+  void readTexts(const std::string& key, std::vector<std::string>* values);
+  void readNumbers(const std::string& key, std::vector<double>* values, const NumberRange& range);
   int indexOfChoice(const std::string& key, const std::vector<std::string>& names,
                     const std::vector<std::string>& shown);
 
@@ -88,6 +104,9 @@ class YamlSection {
   std::string path_;
   std::vector<std::string>* problems_;
   std::vector<std::string> known_;
+  YamlTree resolved_ = YamlTree::map();
+  YamlSection* parent_ = nullptr;
+  std::string key_in_parent_;
 };
 
 }  // namespace semantic_lidar_fusion

@@ -99,9 +99,11 @@ struct SegmentationConfig {
 };
 
 struct Rig {
-  std::string yaml;  ///< what it was read from, overrides applied; keys left out have their default
-  std::string name;  ///< default: the rig file's, without extension
-  LabelSet classes;  ///< key `classes`: {file: PATH}, a path or a set in place
+  /// Every key that the loader knows, with what it came to: overrides applied, defaults filled in,
+  /// paths absolute, the class set in place. A rig file of its own: it loads again as this rig.
+  std::string yaml;
+  std::string name;                   ///< default: the rig file's, without extension
+  LabelSet classes;                   ///< key `classes`: {file: PATH}, a path or a set in place
   std::vector<CameraConfig> cameras;  ///< at most 16; the position is the bit in `cameras`
   LidarConfig lidar;
   std::string fixed_frame = "odom";

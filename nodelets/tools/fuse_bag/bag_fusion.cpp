@@ -13,6 +13,7 @@
 
 #include "edge/conversions.h"
 #include "edge/topics.h"
+#include "edge/version.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "tools/common/progress_bar.h"
@@ -251,6 +252,7 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
 
   if (scans_written_ == 0) {
     output->writeLatched("/class_info", rigid.cloud.stamp, classInfoMessage(rig_.classes));
+    output->writeLatched("/configuration", rigid.cloud.stamp, configurationMessage(rig_));
   }
   output->write("/scan_reference", scan_ns, scanReferenceMessage(scan_ns, rigid.cloud.stamp));
   for (std::size_t c = 0; c < camera_count; ++c) {

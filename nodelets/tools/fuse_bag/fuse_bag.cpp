@@ -9,7 +9,9 @@
 #include <string>
 #include <vector>
 
+#include "edge/version.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/config/rig.h"
 #include "tools/fuse_bag/bag_fusion.h"
 #include "tools/fuse_bag/fuse_bag_options.h"
 
@@ -34,6 +36,13 @@ bool sameFile(const std::string& a, const std::string& b) {
   return status_a.st_dev == status_b.st_dev && status_a.st_ino == status_b.st_ino;
 }
 
+/// Throws Error where nobody takes the text: a full disk, a closed stdout.
+void print(const std::string& text) {
+  if (std::fputs(text.c_str(), stdout) < 0 || std::fflush(stdout) != 0) {
+    throw Error("stdout: cannot be written");
+  }
+}
+
 void fuse(const FuseBagOptions& options) {
   if (sameFile(options.input, options.output) || sameFile(options.input, options.output + ".tmp")) {
     throw Error(options.output + ": is the input bag itself");
@@ -47,7 +56,15 @@ int run(const std::vector<std::string>& arguments) {
   try {
     const FuseBagOptions options = parseFuseBagOptions(arguments);
     if (options.help) {
-      std::fputs(kFuseBagUsage, stdout);
+      print(kFuseBagUsage);
+      return 0;
+    }
+    if (options.version) {
+      print(std::string("fuse_bag ") + kVersion + "\n");
+      return 0;
+    }
+    if (options.print_rig) {
+      print(configurationText(loadRig(options.rig, options.overrides)));
       return 0;
     }
     fuse(options);

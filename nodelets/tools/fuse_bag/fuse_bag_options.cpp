@@ -5,13 +5,14 @@ namespace semantic_lidar_fusion {
 
 const char kFuseBagUsage[] =
     R"(usage: fuse_bag IN.bag OUT.bag --rig FILE [options]
+       fuse_bag --print-rig --rig FILE [--set KEY=VALUE]
 
 Transfers camera semantics to the lidar points of a bag: the whole pipeline, without a ROS master,
 as fast as the machine allows. The same input gives the same bytes.
 
   IN.bag           lidar, camera_info, tf (or odometry), images and scores
-  OUT.bag          /scan_reference, /points_compensated, /points_semantic, /class_info and for each
-                   camera /<camera>/selection
+  OUT.bag          /scan_reference, /points_compensated, /points_semantic, /class_info,
+                   /configuration (the rig as used) and for each camera /<camera>/selection
 
 options:
   --rig FILE       the rig file (see config/usyd.yaml)
@@ -21,6 +22,9 @@ options:
   --tf             also copy /tf and /tf_static to OUT.bag
   --force          replace OUT.bag whatever it is; without, an earlier output only
   --quiet          no progress and no summary
+  --print-rig      print the rig file with --set applied and every default filled in, and end; the
+                   output is a rig file
+  --version        print the version
   --help           this text
 
 Exit codes: 0 done; 1 failed, and OUT.bag is as before; 2 wrong command line.
@@ -69,6 +73,11 @@ FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
       options.force = true;
     } else if (name == "--quiet" || name == "-q") {
       options.quiet = true;
+    } else if (name == "--print-rig") {
+      options.print_rig = true;
+    } else if (name == "--version") {
+      options.version = true;
+      return options;
     } else if (name == "--help" || name == "-h") {
       options.help = true;
       return options;
@@ -76,13 +85,19 @@ FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
       throw UsageError("unknown option " + argument);
     }
   }
+  if (options.rig.empty() && (options.print_rig || files.size() == 2)) {
+    throw UsageError("--rig FILE is wanted");
+  }
+  if (options.print_rig) {
+    if (!files.empty()) throw UsageError("--print-rig takes no bag; " + files[0] + " was given");
+    return options;
+  }
   if (files.size() != 2) {
     throw UsageError("IN.bag and OUT.bag are wanted; " + std::to_string(files.size()) +
                      " file names were given");
   }
   options.input = files[0];
   options.output = files[1];
-  if (options.rig.empty()) throw UsageError("--rig FILE is wanted");
   return options;
 }
 

@@ -17,6 +17,8 @@ struct FuseBagOptions {
   bool tf = false;
   bool force = false;
   bool quiet = false;
+  bool print_rig = false;
+  bool version = false;
   bool help = false;
 };
 

@@ -27,6 +27,7 @@ struct SimulationOptions {
   bool raw_images = false;  ///< else JPEG
   bool force = false;
   bool quiet = false;
+  bool version = false;
   bool help = false;
   int threads = 2;
   std::string pictures;  ///< folder for PNG files of the first used image of each camera

@@ -12,6 +12,7 @@
 #include <string>
 #include <vector>
 
+#include "edge/version.h"
 #include "tools/simulate_drive/drive_simulation.h"
 
 namespace semantic_lidar_fusion {
@@ -60,6 +61,7 @@ options:
   --pictures DIR       also write PNG files of the first pictures and labels there
   --force              replace BAG if it exists
   --quiet              no progress
+  --version            print the version
   --help               this text
 
 Exit codes: 0 done; 1 failed, and BAG is as before; 2 wrong command line.
@@ -155,6 +157,9 @@ SimulationOptions parseOptions(const std::vector<std::string>& arguments) {
       options.force = true;
     } else if (name == "--quiet") {
       options.quiet = true;
+    } else if (name == "--version") {
+      options.version = true;
+      return options;
     } else if (name == "--help" || name == "-h") {
       options.help = true;
       return options;
@@ -171,6 +176,10 @@ int run(const std::vector<std::string>& arguments) {
     const SimulationOptions options = parseOptions(arguments);
     if (options.help) {
       std::fputs(kUsage, stdout);
+      return 0;
+    }
+    if (options.version) {
+      std::printf("simulate_drive %s\n", kVersion);
       return 0;
     }
     simulateDrive(options, endIfInterrupted);

@@ -4,6 +4,7 @@
 
 #include <filesystem>
 #include <fstream>
+#include <functional>
 #include <random>
 #include <sstream>
 
@@ -510,26 +511,80 @@ TEST(LoadRigTest, UsydIsThePapersRig) {
   EXPECT_EQ(rig.classes.size(), 12);
 }
 
-/// usyd.yaml documents every key: what the loader knows, the file shows with the default's comment.
-TEST(LoadRigTest, UsydNamesEveryKeyOfTheLoader) {
-  const YAML::Node root = parseYamlFile(kConfigFolder + "/usyd.yaml");
-  const auto expectAllKeys = [](const YAML::Node& section, const std::string& text) {
+/// Calls `visit` with the name of each section (empty: the root) and each key that the loader knows
+/// there.
+void forEveryKey(const std::function<void(const std::string&, const std::string&)>& visit) {
+  const auto visitKeys = [&](const std::string& section, const std::string& text) {
     // The unknown-key message lists the keys that the loader knows.
     const std::string problem = problemOf(text);
     const std::size_t list = problem.find("known here: ");
     ASSERT_NE(list, std::string::npos) << problem;
     std::istringstream words(problem.substr(list + 12));
-    for (std::string key; std::getline(words >> std::ws, key, ',');) {
-      EXPECT_TRUE(section[key]) << key << " is not in usyd.yaml";
-    }
+    for (std::string key; std::getline(words >> std::ws, key, ',');) visit(section, key);
   };
-  expectAllKeys(root, "qqqqqqqqqqqq: 1");
-  expectAllKeys(root["cameras"][0],
-                "classes: classes_usyd12.yaml\ncameras: [{name: A0, qqqqqqqqqqqq: 1}]");
-  for (const char* section : {"lidar", "superpixels", "uncertainty", "motion", "odometry",
-                              "reference", "segmentation", "occlusion"}) {
-    expectAllKeys(root[section], std::string(section) + ": {qqqqqqqqqqqq: 1}");
+  visitKeys("", "qqqqqqqqqqqq: 1");
+  visitKeys("cameras", "classes: classes_usyd12.yaml\ncameras: [{name: A0, qqqqqqqqqqqq: 1}]");
+  const YAML::Node resolved = YAML::Load(parse("").yaml);
+  for (const auto& item : resolved) {
+    const auto name = item.first.as<std::string>();
+    if (item.second.IsMap()) visitKeys(name, name + ": {qqqqqqqqqqqq: 1}");
   }
+}
+
+/// usyd.yaml documents every key: what the loader knows, the file shows with the default's comment.
+TEST(LoadRigTest, UsydNamesEveryKeyOfTheLoader) {
+  const YAML::Node root = parseYamlFile(kConfigFolder + "/usyd.yaml");
+  forEveryKey([&](const std::string& section, const std::string& key) {
+    const YAML::Node node = section.empty()        ? root
+                            : section == "cameras" ? root["cameras"][0]
+                                                   : root[section];
+    EXPECT_TRUE(node[key]) << section << "." << key << " is not in usyd.yaml";
+  });
+}
+
+/// What is printed, published and written into bags holds every key: none can be forgotten.
+TEST(ResolvedRig, HasEveryKeyThatTheLoaderAccepts) {
+  const YAML::Node resolved = YAML::Load(parse(kTwoCameras).yaml);
+  int keys = 0;
+  forEveryKey([&](const std::string& section, const std::string& key) {
+    const YAML::Node node = section.empty()        ? resolved
+                            : section == "cameras" ? resolved["cameras"][0]
+                                                   : resolved[section];
+    EXPECT_TRUE(node[key]) << section << "." << key;
+    ++keys;
+  });
+  EXPECT_GT(keys, 60);
+}
+
+TEST(ResolvedRig, LoadsAgainAsTheSameRig) {
+  for (const char* file : {"usyd.yaml", "kitti.yaml", "demo.yaml"}) {
+    const Rig rig = loadRig(kConfigFolder + "/" + file, {"occlusion.mode=off", "threads=2"});
+    // Nothing in it is relative to a folder, or to the name of the file.
+    const Rig again = rigFromYaml(parseYaml(rig.yaml, "x"), "/nowhere", "another.yaml");
+    EXPECT_EQ(again.yaml, rig.yaml) << file;
+    EXPECT_EQ(again.name, rig.name);
+    EXPECT_EQ(again.classes.toJson(), rig.classes.toJson());
+    EXPECT_EQ(again.occlusion.mode, OcclusionMode::kOff);
+    EXPECT_EQ(again.threads, 2);
+    ASSERT_EQ(again.cameras.size(), rig.cameras.size());
+    for (std::size_t i = 0; i < rig.cameras.size(); ++i) {
+      EXPECT_EQ(again.cameras[i].ns, rig.cameras[i].ns);
+      EXPECT_EQ(again.cameras[i].scores, rig.cameras[i].scores);
+    }
+  }
+}
+
+TEST(ResolvedRig, SaysWhatTheDefaultsCameTo) {
+  const YAML::Node resolved =
+      YAML::Load(parse(kTwoCameras, {"motion={enabled: false}", "cameras.left.input=labels"}).yaml);
+  EXPECT_FALSE(resolved["motion"]["enabled"].as<bool>());
+  EXPECT_EQ(resolved["motion"]["granularity"].as<std::string>(), "firing");
+  EXPECT_EQ(resolved["reference"]["camera"].as<std::string>(), "left");
+  EXPECT_EQ(resolved["cameras"][0]["scores"].as<std::string>(), "labels");
+  EXPECT_EQ(resolved["cameras"][1]["scores"].as<std::string>(), "scores");
+  EXPECT_EQ(resolved["cameras"][1]["timeout"].as<double>(), 0.4);
+  EXPECT_EQ(resolved["lidar"]["topic"].as<std::string>(), "velodyne_packets");
+  EXPECT_EQ(resolved["classes"]["classes"].size(), 12u);
 }
 
 TEST(LoadRigTest, NamesTheFileOfEachProblem) {
