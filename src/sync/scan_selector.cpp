@@ -244,10 +244,7 @@ void ScanSelector::settleReference(PendingScan* pending, StampNs waited_ns, Wait
         !isDecided(images, target_ns, config_.cameras[camera].reorder_window_ns)) {
       return;
     }
-    std::optional<StampNs> image_ns;
-    if (waiting == Waiting::kNoLonger || reaches(images, target_ns)) {
-      image_ns = closest(images, target_ns);
-    }
+    const std::optional<StampNs> image_ns = closest(images, target_ns);
     if (image_ns && distance(*image_ns, target_ns) <= config_.reference_timeout_ns) {
       decision.reference_ns = *image_ns;
       remember(config_.reference_camera, target_ns, distance(*image_ns, target_ns));

@@ -7,11 +7,11 @@
 /// cameras. The class has no clock: `advance` passes the current time in.
 ///
 /// Settling. A decision is settled as soon as a stamp at or after its target is known, else when
-/// the timeout has passed since the scan was added: t_ref is then the middle of the scan, a camera
-/// gives the closest image that it has. An image further from the middle than the reference timeout
-/// is not in time either, even if it is known. Decisions therefore depend on stamps alone, however
-/// scans, cameras and duplicates interleave, as long as no timeout passes and the images of each
-/// camera arrive in the order of their stamps (one connection delivers them so) or at most
+/// the timeout has passed since the scan was added, or when no more stamps will come (`finish`):
+/// the closest image that is known is then taken. t_ref is the middle of the scan where no image is
+/// known that is within the reference timeout of it. Decisions therefore depend on stamps alone,
+/// however scans, cameras and duplicates interleave, as long as no timeout passes and the images of
+/// each camera arrive in the order of their stamps (one connection delivers them so) or at most
 /// `reorder_window_ns` out of it. An image that comes too late to be chosen changes nothing and is
 /// counted.
 ///

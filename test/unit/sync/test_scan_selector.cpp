@@ -144,14 +144,26 @@ TEST(ScanSelectorTest, NothingWithinTheLimitIsNone) {
   EXPECT_EQ(selector.counters().camera_none, (std::vector<std::uint64_t>{0, 1}));
 }
 
-TEST(ScanSelectorTest, ReferenceTimeoutGivesTheMiddle) {
+TEST(ScanSelectorTest, ReferenceTimeoutTakesTheClosestImageThatIsKnown) {
   ScanSelector selector(cameras(2));
   selector.addImage(0, kStart + 30 * kMs);
   selector.addImage(1, kStart + 30 * kMs);
   selector.addScan(scanAt(kStart), 1000);
   EXPECT_EQ(describe(selector.advance(1000 + 200 * kMs - 1)), "");
   EXPECT_EQ(describe(selector.advance(1000 + 200 * kMs)),
-            "scan 0 t_ref 50000000 timed out\nscan 0 camera 0 image 30000000 timed out\n"
+            "scan 0 t_ref 30000000\nscan 0 camera 0 image 30000000\n"
+            "scan 0 camera 1 image 30000000\n");
+  EXPECT_EQ(selector.counters().reference_timeouts, 0u);
+}
+
+TEST(ScanSelectorTest, ReferenceTimeoutGivesTheMiddleWithoutAnImageInTime) {
+  ScanSelector selector(cameras(2));
+  selector.addImage(0, kStart + 50 * kMs - 200 * kMs - 1);
+  selector.addImage(1, kStart + 30 * kMs);
+  selector.addScan(scanAt(kStart), 1000);
+  EXPECT_EQ(describe(selector.advance(1000 + 200 * kMs - 1)), "");
+  EXPECT_EQ(describe(selector.advance(1000 + 200 * kMs)),
+            "scan 0 t_ref 50000000 timed out\nscan 0 camera 0 none timed out\n"
             "scan 0 camera 1 image 30000000 timed out\n");
   EXPECT_EQ(selector.counters().reference_timeouts, 1u);
   EXPECT_EQ(selector.counters().camera_timeouts, (std::vector<std::uint64_t>{1, 1}));
@@ -236,6 +248,22 @@ TEST(ScanSelectorTest, FinishSettlesEverythingWithWhatIsKnown) {
             "scan 0 camera 0 image 30000000\nscan 0 camera 1 none timed out\n"
             "scan 300000000 camera 0 none timed out\nscan 300000000 camera 1 none timed out\n");
   EXPECT_EQ(selector.pendingScans(), 0u);
+}
+
+TEST(ScanSelectorTest, TheLastScanIsTheSameAfterTheTimeoutAndAtTheEndOfABag) {
+  for (const StampNs last_image : {-160, -140, 0, 30, 49}) {
+    ScanSelector live(cameras(2)), offline(cameras(2));
+    for (ScanSelector* selector : {&live, &offline}) {
+      for (int camera = 0; camera < 2; ++camera) {
+        selector->addImage(camera, kStart - 300 * kMs);
+        selector->addImage(camera, kStart + last_image * kMs);
+      }
+      selector->addScan(scanAt(kStart), 1000);
+    }
+    const std::string decided = describe(live.advance(1000 + 200 * kMs));
+    EXPECT_EQ(decided, describe(offline.finish())) << last_image;
+    EXPECT_NE(decided, "");
+  }
 }
 
 TEST(ScanSelectorTest, ReorderWindowWaitsForImagesThatAreOvertaken) {
@@ -739,10 +767,8 @@ SelectorDecisions timedDecisions(const World& world, const std::vector<Arrival>&
       const StampNs known = std::max(arrival.now_ns, reached(c, middle));
       reference_settled = std::min({known, deadline, end});
       reference_by_deadline = known >= deadline && deadline <= end;
-      std::optional<StampNs> stamp;
-      if (!reference_by_deadline) {
-        stamp = closestStamp(arrived(c, std::min(known, end), true), offset, middle);
-      }
+      const std::optional<StampNs> stamp =
+          closestStamp(arrived(c, reference_settled, !reference_by_deadline), offset, middle);
       if (stamp && std::abs(*stamp + offset - middle) <= world.config.reference_timeout_ns) {
         reference.reference_ns = *stamp + offset;
       } else {
