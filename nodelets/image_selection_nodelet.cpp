@@ -10,10 +10,10 @@
 #include "base/fusion_nodelet.h"
 #include "edge/camera_geometry.h"
 #include "edge/conversions.h"
-#include "edge/fusion_chain.h"
 #include "edge/lidar_decoder.h"
 #include "edge/tf_subscription.h"
 #include "edge/topics.h"
+#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 #include "semantic_lidar_fusion/sync/stamped_store.h"
@@ -110,7 +110,7 @@ class ImageSelectionNodelet : public FusionNodelet {
             onImage(index, {image, nullptr}, stampNs(image->header.stamp));
           });
     }
-    if (candidatesNeedSemantics()) {
+    if (semanticsComeAlone()) {
       camera.semantics_subscriber = subscribe<sensor_msgs::Image>(
           getNodeHandle(), semanticsTopic(rig(), config), 32,
           [this, index](const sensor_msgs::ImageConstPtr& scores) { onSemantics(index, *scores); });
@@ -123,8 +123,8 @@ class ImageSelectionNodelet : public FusionNodelet {
     }
   }
 
-  /// A free-running network of another node: only images whose scores have arrived can be chosen.
-  bool candidatesNeedSemantics() const {
+  /// A free-running network of another node: its scores come whether or not an image is chosen.
+  bool semanticsComeAlone() const {
     return rig().segmentation.mode == SegmentationMode::kFreeRunning &&
            rig().segmentation.model.empty();
   }
@@ -134,10 +134,7 @@ class ImageSelectionNodelet : public FusionNodelet {
     if (!usable(imageTopic(camera.config), stamp)) return;
     camera.images.put(stamp, image);
     trim(&camera);
-    if (!candidatesNeedSemantics() || camera.semantics.find(stamp) != nullptr) {
-      selector_->addImage(index, stamp);
-      decide();
-    }
+    offer(index, stamp);
   }
 
   void onSemantics(int index, const sensor_msgs::Image& scores) {
@@ -145,12 +142,17 @@ class ImageSelectionNodelet : public FusionNodelet {
     const StampNs stamp = stampNs(scores.header.stamp);
     if (scores.data.empty() || !usable(semanticsTopic(rig(), camera.config), stamp)) return;
     camera.semantics.put(stamp, true);
-    // Nothing is clustered for a camera that brings probabilities: it needs no image.
-    if (camera.config.input == CameraInput::kProbabilities ||
-        camera.images.find(stamp) != nullptr) {
-      selector_->addImage(index, stamp);
-      decide();
-    }
+    offer(index, stamp);
+  }
+
+  /// Lets an image be chosen once the parts of it that must be there have come.
+  void offer(int index, StampNs stamp) {
+    const Camera& camera = *cameras_[static_cast<std::size_t>(index)];
+    const ImageParts parts{camera.images.find(stamp) != nullptr,
+                           camera.semantics.find(stamp) != nullptr};
+    if (!isCandidate(camera.config.input, parts, !semanticsComeAlone())) return;
+    selector_->addImage(index, stamp);
+    decide();
   }
 
   /// Old images make room, by number (StampedStore) and by bytes.

@@ -17,7 +17,7 @@
 #include "edge/lidar_decoder.h"
 #include "edge/tf_subscription.h"
 #include "edge/topics.h"
-#include "semantic_lidar_fusion/motion/compensation.h"
+#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/stamped_store.h"
 
@@ -45,6 +45,7 @@ class MotionCompensationNodelet : public FusionNodelet {
   };
 
   void initialize() override {
+    pipeline_ = std::make_unique<ScanPipeline>(rig(), PipelineSteps{PipelineStep::kCompensate});
     lidar_ = std::make_unique<LidarDecoder>(
         rig().lidar,
         [this](const std::string& reason, std::uint64_t count) { onDropped(reason, count); },
@@ -152,13 +153,11 @@ class MotionCompensationNodelet : public FusionNodelet {
   void release() {
     while (!pending_.empty()) {
       const Scan& scan = pending_.front();
-      if (scan.cloud.empty()) {
-        Cloud empty;
-        empty.frame_id = scan.cloud.frame_id;
-        empty.stamp = empty.first_point_ns = scan.cloud.header_stamp;
+      if (scan.cloud.empty()) {  // has no time that a t_ref or odometry could belong to
         health().count("empty scans");
+        TimedCloud empty = std::move(pending_.front().cloud);
         pending_.pop_front();
-        publish(output_, compensatedCloudMessage(empty));
+        publishCompensated(std::move(empty), 0, std::nullopt);
         continue;
       }
       const Reference* reference = references_.find(scan.interval.first_ns);
@@ -189,19 +188,17 @@ class MotionCompensationNodelet : public FusionNodelet {
       }
       Scan leaving = std::move(pending_.front());
       pending_.pop_front();  // first: an error must not meet it again
-      publishCompensated(std::move(leaving.cloud), t_ref, T_vehicle_lidar);
+      publishCompensated(std::move(leaving.cloud), t_ref, T_vehicle_lidar.transform);
     }
   }
 
-  void publishCompensated(TimedCloud scan, StampNs t_ref, const TransformAnswer& T_vehicle_lidar) {
+  void publishCompensated(TimedCloud scan, StampNs t_ref,
+                          const std::optional<Transform>& T_vehicle_lidar) {
     CompensationResult compensated;
     {
       const StageTimer timer(health(), "compensation");
-      // Without extrinsics no pose of the lidar is known: the same as no odometry.
-      static const PoseBuffer kNoOdometry;
-      compensated = compensate(
-          std::move(scan), t_ref, T_vehicle_lidar ? tf_->source().odometry() : kNoOdometry,
-          T_vehicle_lidar.transform.value_or(Transform::Identity()), rig().compensationConfig());
+      compensated =
+          pipeline_->compensate(std::move(scan), t_ref, tf_->source().odometry(), T_vehicle_lidar);
     }
     const CompensationCounters& counters = compensated.counters;
     health().count("points", compensated.cloud.size());
@@ -216,6 +213,7 @@ class MotionCompensationNodelet : public FusionNodelet {
     return output_.getNumSubscribers() == 0 ? "nobody listens to " + output_.getTopic() : "";
   }
 
+  std::unique_ptr<ScanPipeline> pipeline_;
   std::unique_ptr<LidarDecoder> lidar_;
   std::string told_time_decision_;
   std::unique_ptr<TfSubscription> tf_;

@@ -14,9 +14,9 @@
 #include "base/fusion_nodelet.h"
 #include "edge/camera_geometry.h"
 #include "edge/conversions.h"
-#include "edge/fusion_chain.h"
 #include "edge/tf_subscription.h"
 #include "edge/topics.h"
+#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/fusion_queue.h"
@@ -55,7 +55,8 @@ class ProjectionNodelet : public FusionNodelet {
   };
 
   void initialize() override {
-    chain_ = std::make_unique<FusionChain>(rig(), /*with_network=*/false);
+    pipeline_ = std::make_unique<ScanPipeline>(
+        rig(), PipelineSteps{PipelineStep::kView, PipelineStep::kFuse});
 
     FusionQueueConfig queue;
     StampNs longest_wait_ns = 0;
@@ -220,10 +221,6 @@ class ProjectionNodelet : public FusionNodelet {
 
   // --- Fusion
 
-  StampNs trueImageTime(const Camera& camera, StampNs raw_stamp) const {
-    return raw_stamp + toNs(camera.config.time_offset_s);
-  }
-
   /// Tells the queue of every image whose semantics are whole and whose time odometry covers.
   void announceReady() {
     for (const auto& camera : cameras_) {
@@ -231,8 +228,8 @@ class ProjectionNodelet : public FusionNodelet {
         if (known.announced) continue;
         const bool whole = known.probabilities || (known.scores && known.share);
         if (!whole) continue;
-        if (rig().motion_enabled &&
-            !tf_->source().odometry().covers(trueImageTime(*camera, stamp))) {
+        if (!pipeline_->coversImage(static_cast<std::size_t>(camera->index), stamp,
+                                    tf_->source().odometry())) {
           continue;
         }
         camera->semantics.find(stamp)->announced = true;
@@ -258,14 +255,14 @@ class ProjectionNodelet : public FusionNodelet {
     for (const auto& camera : cameras_) {
       const auto index = static_cast<std::size_t>(camera->index);
       const std::optional<SegmentedImage> image = imageOf(*camera, scan.views[index]);
-      views.push_back(chain_->view(index, place(*camera, cloud.frame_id), image ? &*image : nullptr,
-                                   cloud.stamp, tf_->source().odometry(),
-                                   T_vehicle_lidar.transform));
+      views.push_back(pipeline_->view(index, place(*camera, cloud.frame_id),
+                                      image ? &*image : nullptr, cloud.stamp,
+                                      tf_->source().odometry(), T_vehicle_lidar.transform));
     }
     const bool drawn = std::any_of(cameras_.begin(), cameras_.end(), [](const auto& camera) {
       return camera->overlay.getNumSubscribers() > 0;
     });
-    const FusionResult result = chain_->fused(cloud, std::move(views), drawn);
+    const FusionResult result = pipeline_->fuse(cloud, std::move(views), drawn);
     countPoints(result.cloud);
     publish(output_, semanticCloudMessage(result.cloud, rig().classes));
     if (drawn) publishOverlays(scan, result);
@@ -319,12 +316,10 @@ class ProjectionNodelet : public FusionNodelet {
   }
 
   void countPoints(const SemanticCloud& cloud) {
-    static const char* const kNames[] = {
-        "points fused", "points occluded", "points outside every image",
-        "points without an image in time", "points without odometry"};
-    std::uint64_t counts[5] = {};
-    for (const std::uint8_t status : cloud.points.status) ++counts[std::min<int>(status, 4)];
-    for (int i = 0; i < 5; ++i) health().count(kNames[i], counts[i]);
+    const auto counts = countByStatus(cloud.points);
+    for (std::size_t status = 0; status < counts.size(); ++status) {
+      health().count(std::string("points ") + kPointStatusNames[status], counts[status]);
+    }
     health().count("scans");
   }
 
@@ -335,15 +330,16 @@ class ProjectionNodelet : public FusionNodelet {
       });
       Camera& camera = **found;
       if (camera.overlay.getNumSubscribers() == 0) continue;
-      const StampNs stamp = scan.views[static_cast<std::size_t>(camera.index)].image_stamp;
+      const auto index = static_cast<std::size_t>(camera.index);
+      const StampNs stamp = scan.views[index].image_stamp;
       const auto* image = camera.images.find(stamp);
       if (image == nullptr) continue;
       const StageTimer timer(health(), "overlay");
-      publish(
-          camera.overlay,
-          imageMessage(drawProjection(colorImage(*image), report, result.cloud, rig().classes,
-                                      toSeconds(trueImageTime(camera, stamp) - scan.cloud->stamp)),
-                       (*image)->header));
+      publish(camera.overlay,
+              imageMessage(
+                  drawProjection(colorImage(*image), report, result.cloud, rig().classes,
+                                 toSeconds(pipeline_->imageTime(index, stamp) - scan.cloud->stamp)),
+                  (*image)->header));
     }
   }
 
@@ -351,7 +347,7 @@ class ProjectionNodelet : public FusionNodelet {
     return cloud_subscriber_ ? "" : "nobody listens to " + output_.getTopic();
   }
 
-  std::unique_ptr<FusionChain> chain_;
+  std::unique_ptr<ScanPipeline> pipeline_;
   std::unique_ptr<FusionQueue> queue_;
   std::unique_ptr<TfSubscription> tf_;
   EpochMonitor epoch_;

@@ -16,7 +16,7 @@
 #include "edge/conversions.h"
 #include "edge/topics.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "semantic_lidar_fusion/fusion/camera_semantics.h"
+#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/stamped_store.h"
@@ -37,18 +37,20 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
   ~SuperpixelUncertaintyNodelet() override { stop(); }
 
  private:
+  struct Image {
+    sensor_msgs::ImageConstPtr message;
+    SegmentedImage segmented;
+  };
   struct Camera {
-    explicit Camera(const Rig& rig, const CameraConfig& config)
-        : config(config), semantics(rig.superpixels, rig.classes.size(), config.score_format) {}
+    Camera(const CameraConfig& config, std::size_t index) : config(config), index(index) {}
 
     const CameraConfig& config;
-    std::mutex mutex;  ///< guards what follows, up to the publishers
-    CameraSemantics semantics;
+    const std::size_t index;  ///< in the rig file
+    std::mutex mutex;  ///< guards what follows, up to the publishers, and the pipeline's camera
     std::string told_clamping;
     EpochMonitor epoch;
-    StampedStore<sensor_msgs::ImageConstPtr> images{kWaiting};
+    StampedStore<Image> images{kWaiting};
     StampedStore<sensor_msgs::ImageConstPtr> scores{kWaitingScores};
-    StampedStore<std::shared_ptr<const SuperpixelMap>> maps{kWaiting};
 
     ros::Publisher share, superpixels, probabilities, overlay;
     ros::Subscriber image_subscriber, scores_subscriber;
@@ -57,9 +59,11 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
   void initialize() override {
     std::string only;
     getPrivateNodeHandle().getParam("camera", only);
-    for (const CameraConfig& config : rig().cameras) {
+    pipeline_ = std::make_unique<ScanPipeline>(rig(), PipelineSteps{PipelineStep::kSegment});
+    for (std::size_t i = 0; i < rig().cameras.size(); ++i) {
+      const CameraConfig& config = rig().cameras[i];
       if (!only.empty() && config.name != only) continue;
-      cameras_.push_back(std::make_unique<Camera>(rig(), config));
+      cameras_.push_back(std::make_unique<Camera>(config, i));
       Camera& camera = *cameras_.back();
       const auto output = [&](const std::string& name) {
         return advertise<sensor_msgs::Image>(getNodeHandle(), cameraTopic(config, name), 4);
@@ -115,12 +119,12 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
       std::lock_guard<std::mutex> lock(camera->mutex);
       if (!current(camera, "image", image)) return;
       const StampNs stamp = stampNs(image->header.stamp);
+      Image waiting{image, {}};
+      waiting.segmented.stamp = stamp;
+      waiting.segmented.image = colorImage(image);
       health().count("dropped: " + camera->config.name + " image without scores",
-                     camera->images.put(stamp, image));
-      if (const auto size = camera->semantics.mapSize(
-              {static_cast<int>(image->width), static_cast<int>(image->height)})) {
-        cluster(camera, stamp, image, *size);
-      }
+                     camera->images.put(stamp, std::move(waiting)));
+      if (Image* const stored = camera->images.find(stamp)) cluster(camera, &stored->segmented);
       outputs = combine(camera, stamp);
     }
     publishAll(outputs);
@@ -132,7 +136,6 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     {
       std::lock_guard<std::mutex> lock(camera->mutex);
       if (!current(camera, "scores", scores)) return;
-      camera->semantics.noteScores(pixelView(*scores));
       const StampNs stamp = stampNs(scores->header.stamp);
       health().count(camera->config.name + " scores of images that no scan chose",
                      camera->scores.put(stamp, scores));
@@ -154,23 +157,22 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
         health().count("clock jumps");
         camera->images.clear();
         camera->scores.clear();
-        camera->maps.clear();
         return true;
     }
     return true;
   }
 
-  void cluster(Camera* camera, StampNs stamp, const sensor_msgs::ImageConstPtr& image,
-               const ImageSize& map_size) {
-    tellClamping(camera, map_size);
-    const StageTimer timer(health(), "superpixels");
-    camera->maps.put(stamp, std::make_shared<const SuperpixelMap>(
-                                camera->semantics.cluster(colorImage(image), map_size, stamp)));
+  /// Superpixels as soon as their number of pixels is known, in parallel with the network.
+  void cluster(Camera* camera, SegmentedImage* image) {
+    {
+      const StageTimer timer(health(), "superpixels");
+      pipeline_->cluster(camera->index, image);
+    }
+    tellClamping(camera, image->note);
   }
 
   /// Tells once, and in the diagnostics, that a map is too small for the wanted superpixels.
-  void tellClamping(Camera* camera, const ImageSize& map_size) {
-    const std::string note = camera->semantics.clampNote(map_size);
+  void tellClamping(Camera* camera, const std::string& note) {
     if (note.empty() || note == camera->told_clamping) return;
     camera->told_clamping = note;
     health().set(camera->config.name + " superpixels", note);
@@ -182,88 +184,60 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
   /// What can be published for the images of one stamp, with the camera's mutex held.
   Outputs combine(Camera* camera, StampNs stamp) {
     Outputs outputs;
-    const auto* image = camera->images.find(stamp);
+    Image* const image = camera->images.find(stamp);
     if (image == nullptr) return outputs;
-    const std_msgs::Header& header = (*image)->header;
+    const std_msgs::Header& header = image->message->header;
+    SegmentedImage& segmented = image->segmented;
+    const auto add = [&](const ros::Publisher& publisher, const cv::Mat& pixels) {
+      outputs.emplace_back(&publisher, imageMessage(pixels, header));
+    };
     const auto* scores = camera->scores.find(stamp);
     if (camera->config.input == CameraInput::kProbabilities) {
-      if (const auto* map = camera->maps.find(stamp)) {
-        outputs.emplace_back(&camera->superpixels, imageMessage((*map)->ids, header));
+      // They go straight to the projection: all that is made here are superpixels to look at.
+      if (!segmented.superpixels.ids.empty()) {
+        add(camera->superpixels, segmented.superpixels.ids);
         camera->images.erase(stamp);
       }
       return outputs;
     }
     if (scores == nullptr) return outputs;
 
-    const cv::Mat values = fromSemantics(*camera, [&] { return pixelView(**scores); });
-    const ImageSize image_size{static_cast<int>((*image)->width),
-                               static_cast<int>((*image)->height)};
-    const ImageSize map_size = *camera->semantics.mapSize(image_size);
-    const auto* map = camera->maps.find(stamp);
-    if (map == nullptr || ImageSize{(*map)->ids.cols, (*map)->ids.rows} != map_size) {
-      cluster(camera, stamp, *image, map_size);
-      map = camera->maps.find(stamp);
+    segment(camera, **scores, &segmented);
+    if (listened(camera->superpixels)) add(camera->superpixels, segmented.superpixels.ids);
+    if (camera->config.input == CameraInput::kScores) add(camera->share, segmented.share);
+    if (camera->config.input == CameraInput::kLabels || listened(camera->probabilities)) {
+      add(camera->probabilities, pipeline_->probabilities(segmented));
     }
-    if (listened(camera->superpixels)) {
-      outputs.emplace_back(&camera->superpixels, imageMessage((*map)->ids, header));
-    }
-    if (camera->config.input == CameraInput::kLabels) {
-      const StageTimer timer(health(), "histogram");
-      outputs.emplace_back(&camera->probabilities,
-                           imageMessage(fromSemantics(*camera,
-                                                      [&] {
-                                                        return histogramProbabilities(
-                                                            **map, values, rig().classes.size());
-                                                      }),
-                                        header));
-    } else {
-      addShare(*camera, **map, values, *image, &outputs);
+    if (listened(camera->overlay)) {
+      add(camera->overlay,
+          drawUncertainty(segmented.image, segmented.superpixels.ids, segmented.share));
     }
     camera->images.erase(stamp);
     camera->scores.erase(stamp);
-    camera->maps.erase(stamp);
     return outputs;
   }
 
-  /// What `work` makes of the scores or labels; an error names their topic, whichever message's
-  /// arrival it is that shows it.
-  template <class Work>
-  auto fromSemantics(const Camera& camera, const Work& work) -> decltype(work()) {
+  /// An error names the topic of the scores or labels, whichever message's arrival it is that shows
+  /// it.
+  void segment(Camera* camera, const sensor_msgs::Image& scores, SegmentedImage* image) {
     try {
-      return work();
+      image->input = pixelView(scores);
+      const StageTimer timer(health(),
+                             camera->config.input == CameraInput::kLabels ? "histogram" : "share");
+      pipeline_->segment(camera->index, image);
     } catch (const DataError& problem) {
-      throw DataError(getNodeHandle().resolveName(semanticsTopic(rig(), camera.config)) + ": " +
+      throw DataError(getNodeHandle().resolveName(semanticsTopic(rig(), camera->config)) + ": " +
                       problem.what());
     }
-  }
-
-  void addShare(const Camera& camera, const SuperpixelMap& map, const cv::Mat& scores,
-                const sensor_msgs::ImageConstPtr& image, Outputs* outputs) {
-    ShareMap share;
-    {
-      const StageTimer timer(health(), "share");
-      share = fromSemantics(camera, [&] { return camera.semantics.share(map, scores); });
-    }
-    health().count("non-finite score cells", share.nonfinite_cells);
-    outputs->emplace_back(&camera.share, imageMessage(share.share, image->header));
-    if (listened(camera.probabilities)) {
-      const ScoreMap score_map(scores, rig().classes.size(), camera.config.score_format);
-      outputs->emplace_back(
-          &camera.probabilities,
-          imageMessage(denseProbabilities(score_map, share.share, rig().uncertainty),
-                       image->header));
-    }
-    if (listened(camera.overlay)) {
-      outputs->emplace_back(
-          &camera.overlay,
-          imageMessage(drawUncertainty(colorImage(image), map.ids, share.share), image->header));
-    }
+    tellClamping(camera, image->note);
+    health().count("non-finite score cells", image->nonfinite_cells);
   }
 
   void publishAll(const Outputs& outputs) {
     for (const auto& [publisher, message] : outputs) publish(*publisher, message);
   }
 
+  std::unique_ptr<ScanPipeline> pipeline_;
   std::vector<std::unique_ptr<Camera>> cameras_;
 };
 

@@ -4,9 +4,10 @@
 #include <limits>
 #include <vector>
 
+#include "semantic_lidar_fusion/common/types.h"
+
 namespace semantic_lidar_fusion {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 
 /// Polynomial, lowest power first.

@@ -3,6 +3,8 @@
 
 #include <algorithm>
 
+#include "time_kernels.h"
+
 namespace semantic_lidar_fusion {
 
 void TimedCloud::reserve(std::size_t points) {
@@ -17,8 +19,11 @@ void TimedCloud::reserve(std::size_t points) {
 
 ScanInterval scanInterval(const TimedCloud& cloud) {
   if (cloud.time_ns.empty()) return {cloud.header_stamp, cloud.header_stamp};
-  const auto range = std::minmax_element(cloud.time_ns.begin(), cloud.time_ns.end());
-  return {*range.first, *range.second};
+  static const TimeKernelList list = usableTimeKernels();
+  ScanInterval interval;
+  list.kernels[list.count - 1]->span(cloud.time_ns.data(), static_cast<int>(cloud.time_ns.size()),
+                                     &interval.first_ns, &interval.last_ns);
+  return interval;
 }
 
 void Cloud::resize(std::size_t points) {
@@ -29,6 +34,14 @@ void Cloud::resize(std::size_t points) {
   ring.resize(points, kNoRing);
   dt.resize(points);
   status.resize(points);
+}
+
+std::array<std::uint64_t, kPointStatusNames.size()> countByStatus(const Cloud& cloud) {
+  std::array<std::uint64_t, kPointStatusNames.size()> counts{};
+  for (const std::uint8_t status : cloud.status) {
+    ++counts[std::min<std::size_t>(status, counts.size() - 1)];
+  }
+  return counts;
 }
 
 }  // namespace semantic_lidar_fusion

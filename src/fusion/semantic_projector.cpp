@@ -17,9 +17,9 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-std::string sizeText(const cv::Mat& image) {
-  return std::to_string(image.cols) + "x" + std::to_string(image.rows) + " with " +
-         std::to_string(image.channels()) + " channels of depth " + std::to_string(image.depth());
+std::string describe(const cv::Mat& image) {
+  return sizeText({image.cols, image.rows}) + " with " + std::to_string(image.channels()) +
+         " channels of depth " + std::to_string(image.depth());
 }
 
 void checkConfig(const FusionConfig& config) {
@@ -54,7 +54,7 @@ void checkSemantics(const std::string& camera, const ImageSemantics& semantics, 
   }
   if (!lazy) {
     if (semantics.probabilities.type() != CV_32FC(class_count)) {
-      throw DataError(camera + "probabilities are " + sizeText(semantics.probabilities) +
+      throw DataError(camera + "probabilities are " + describe(semantics.probabilities) +
                       ", must be 32-bit float (5) with " + std::to_string(class_count) +
                       " channels");
     }
@@ -67,7 +67,7 @@ void checkSemantics(const std::string& camera, const ImageSemantics& semantics, 
   }
   if (semantics.share.empty()) throw DataError(camera + "has scores but no share");
   if (semantics.share.type() != CV_32FC1) {
-    throw DataError(camera + "share is " + sizeText(semantics.share) +
+    throw DataError(camera + "share is " + describe(semantics.share) +
                     ", must be 32-bit float (5) with 1 channel");
   }
 }
@@ -88,7 +88,7 @@ void checkViews(const std::vector<CameraView>& views, int class_count) {
     }
     used |= 1u << view.rig_index;
     if (!view.ego_mask.empty() && view.ego_mask.type() != CV_8UC1) {
-      throw DataError(camera + "mask is " + sizeText(view.ego_mask) +
+      throw DataError(camera + "mask is " + describe(view.ego_mask) +
                       ", must be 8-bit (0) with 1 channel");
     }
     if (!view.T_camera_lidar_static.matrix().allFinite() ||
@@ -299,41 +299,41 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
 }
 
 /// Votes [begin, end) of a camera.
-struct Share {
+struct VoteBlock {
   std::size_t camera, begin, end;
   std::size_t nonfinite = 0;
 };
 
-/// Even shares of all cameras' votes: cameras alone are too few to divide among threads.
-std::vector<Share> sharesOf(const std::vector<CameraOutcome>& outcomes) {
-  constexpr std::size_t kShare = 1024;
-  std::vector<Share> shares;
+/// Even blocks of all cameras' votes: cameras alone are too few to divide among threads.
+std::vector<VoteBlock> blocksOf(const std::vector<CameraOutcome>& outcomes) {
+  constexpr std::size_t kVotes = 1024;
+  std::vector<VoteBlock> blocks;
   for (std::size_t camera = 0; camera < outcomes.size(); ++camera) {
     const std::size_t votes = outcomes[camera].pixels.size();
-    for (std::size_t begin = 0; begin < votes; begin += kShare) {
-      shares.push_back({camera, begin, std::min(votes, begin + kShare)});
+    for (std::size_t begin = 0; begin < votes; begin += kVotes) {
+      blocks.push_back({camera, begin, std::min(votes, begin + kVotes)});
     }
   }
-  return shares;
+  return blocks;
 }
 
-/// Reads the probabilities of a share of a camera's votes.
-void transfer(int class_count, CameraOutcome* outcome, Share* share) {
+/// Reads the probabilities of a block of a camera's votes.
+void transfer(int class_count, CameraOutcome* outcome, VoteBlock* block) {
   constexpr std::size_t kAhead = 16;  // enough to hide a trip to the memory
   const auto classes = static_cast<std::size_t>(class_count);
   const PixelDistribution& distribution = *outcome->distribution;
   const std::vector<Pixel>& pixels = outcome->pixels;
   std::vector<float> scratch(classes);
-  for (std::size_t k = share->begin; k < std::min(share->begin + kAhead, share->end); ++k) {
+  for (std::size_t k = block->begin; k < std::min(block->begin + kAhead, block->end); ++k) {
     distribution.prefetch(pixels[k].column, pixels[k].row);
   }
-  for (std::size_t k = share->begin; k < share->end; ++k) {
-    if (k + kAhead < share->end) {
+  for (std::size_t k = block->begin; k < block->end; ++k) {
+    if (k + kAhead < block->end) {
       distribution.prefetch(pixels[k + kAhead].column, pixels[k + kAhead].row);
     }
     double* const out = &outcome->votes.probabilities[k * classes];
     if (!distribution.read(pixels[k].column, pixels[k].row, scratch.data(), out)) {
-      ++share->nonfinite;
+      ++block->nonfinite;
     }
   }
 }
@@ -429,12 +429,12 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
     }
   });
 
-  std::vector<Share> shares = sharesOf(outcomes);
-  pool_->forEach(static_cast<int>(shares.size()), [&](int k) {
-    Share& share = shares[static_cast<std::size_t>(k)];
-    transfer(config_.class_count, &outcomes[share.camera], &share);
+  std::vector<VoteBlock> blocks = blocksOf(outcomes);
+  pool_->forEach(static_cast<int>(blocks.size()), [&](int k) {
+    VoteBlock& block = blocks[static_cast<std::size_t>(k)];
+    transfer(config_.class_count, &outcomes[block.camera], &block);
   });
-  for (const Share& share : shares) outcomes[share.camera].report.nonfinite += share.nonfinite;
+  for (const VoteBlock& block : blocks) outcomes[block.camera].report.nonfinite += block.nonfinite;
 
   std::vector<CameraVotes> votes;
   votes.reserve(views.size());

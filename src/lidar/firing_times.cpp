@@ -6,7 +6,7 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kRadPerDeg = 3.14159265358979323846 / 180.0;
+constexpr double kRadPerDeg = kPi / 180.0;
 
 constexpr StampNs kPuckLaserNs = 2304;
 constexpr StampNs kPuckFiringNs = 55296;

@@ -20,7 +20,7 @@ constexpr std::size_t kReturnBytes = 3;
 constexpr std::size_t kModeOffset = 1204;
 constexpr std::size_t kFactoryOffset = 1205;
 constexpr int kFullTurn = 36000;  ///< 0.01 deg
-constexpr double kRadPerUnit = 3.14159265358979323846 / 18000.0;
+constexpr double kRadPerUnit = kPi / 18000.0;
 constexpr std::size_t kMaxPointsPerPacket = kBlocksPerPacket * kReturnsPerBlock;
 
 unsigned littleEndian16(const std::uint8_t* bytes) { return bytes[0] | bytes[1] << 8; }

@@ -14,7 +14,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr StampNs kDayNs = 86400 * kNsPerSecond;
 /// No scan is longer; relative times beyond it belong to another clock.
 constexpr StampNs kLongestOffsetNs = 60 * kNsPerSecond;

@@ -421,11 +421,7 @@ std::vector<float> secondsSince(StampNs reference_ns, const std::vector<StampNs>
 
 /// The scan as a rigid cloud whose points do not move; takes over its arrays.
 Cloud asMeasured(TimedCloud* scan, StampNs reference_ns) {
-  ScanInterval span{scan->header_stamp, scan->header_stamp};
-  if (!scan->empty()) {
-    kernels().span(scan->time_ns.data(), static_cast<int>(scan->size()), &span.first_ns,
-                   &span.last_ns);
-  }
+  const ScanInterval span = scanInterval(*scan);
   Cloud cloud;
   cloud.frame_id = scan->frame_id;
   cloud.stamp = scan->empty() ? scan->header_stamp : reference_ns;

@@ -21,14 +21,6 @@ int timesWithin(const std::int64_t* times, int count, std::int64_t begin, std::u
   return within;
 }
 
-void span(const std::int64_t* times, int count, std::int64_t* first, std::int64_t* last) {
-  *first = *last = times[0];
-  for (int i = 1; i < count; ++i) {
-    *first = times[i] < *first ? times[i] : *first;
-    *last = times[i] > *last ? times[i] : *last;
-  }
-}
-
 void move(const LinearMotion& motion, const float* ns, int count, float* __restrict x,
           float* __restrict y, float* __restrict z) {
   const float* const a = motion.start;
@@ -54,7 +46,7 @@ void secondsSince(std::int64_t reference, const std::int64_t* times, int count, 
 
 }  // namespace
 
-const MotionKernels kPlainMotionKernels = {"plain", timesWithin, span, move, secondsSince};
+const MotionKernels kPlainMotionKernels = {"plain", timesWithin, move, secondsSince};
 
 MotionKernelList usableMotionKernels() {
   MotionKernelList list{1, {&kPlainMotionKernels, nullptr}};

@@ -23,9 +23,6 @@ struct MotionKernels {
   int (*timesWithin)(const std::int64_t* times, int count, std::int64_t begin, std::uint32_t length,
                      float* ns);
 
-  /// The earliest and the latest of `count` >= 1 times.
-  void (*span)(const std::int64_t* times, int count, std::int64_t* first, std::int64_t* last);
-
   /// Moves each point as the motion is at its own time.
   void (*move)(const LinearMotion& motion, const float* ns, int count, float* x, float* y,
                float* z);

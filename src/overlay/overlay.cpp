@@ -255,9 +255,8 @@ std::vector<LegendRow> projectionLegend(const CameraFusionReport& report,
   title.items.push_back(
       countItem("masked", camera(PointStatus::kOutsideImages), Mark::kDot, kMasked));
   scan.items.push_back(textItem("scan:", ""));
-  const char* names[] = {"fused", "occluded", "outside", "no image", "no odometry"};
   for (std::size_t s = 0; s < in_scan.size(); ++s) {
-    scan.items.push_back(countItem(names[s], in_scan[s], Mark::kNone, {}));
+    scan.items.push_back(countItem(kPointStatusNames[s], in_scan[s], Mark::kNone, {}));
   }
   for (int c = 0; c < classes.size(); ++c) {
     colors.items.push_back(countItem(classes[c].name, of_class[static_cast<std::size_t>(c)],
@@ -376,10 +375,9 @@ cv::Mat drawUncertainty(const cv::Mat& image, const cv::Mat& superpixel_ids, con
   checkMap(superpixel_ids, CV_32SC1, "superpixel_ids");
   checkMap(share, CV_32FC1, "share");
   if (!superpixel_ids.empty() && !share.empty() && superpixel_ids.size() != share.size()) {
-    throw DataError("overlay: superpixel_ids are " + std::to_string(superpixel_ids.cols) + "x" +
-                    std::to_string(superpixel_ids.rows) + ", share is " +
-                    std::to_string(share.cols) + "x" + std::to_string(share.rows) +
-                    "; must be equal");
+    throw DataError("overlay: superpixel_ids are " +
+                    sizeText({superpixel_ids.cols, superpixel_ids.rows}) + ", share is " +
+                    sizeText({share.cols, share.rows}) + "; must be equal");
   }
   cv::Mat canvas = toBgr(image).clone();
   const cv::Size grid = share.empty() ? superpixel_ids.size() : share.size();

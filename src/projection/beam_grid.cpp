@@ -14,7 +14,6 @@ namespace semantic_lidar_fusion {
 
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr float kTwoPi = 6.28318530717958647692f;
 
 /// Neighbours closer in range than this, or than this part of their distance across the beam, lie

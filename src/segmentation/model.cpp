@@ -245,8 +245,7 @@ SegmentationModel::SegmentationModel(const std::string& model_file, const LabelS
       impl_->net.setPreferableTarget(cv::dnn::DNN_TARGET_CPU);
       const ImageSize& input = description.input;
       if (input.width > 0 && input.height > 0) {
-        failure = "does not take an input of " + std::to_string(input.width) + "x" +
-                  std::to_string(input.height) + ": ";
+        failure = "does not take an input of " + sizeText(input) + ": ";
         impl_->output_channels = outputShape(impl_->net, input)[1];
         if (!description.channels_of_class.empty()) {
           checkChannels(description, impl_->output_channels, &problems);

@@ -487,13 +487,11 @@ Slic& Slic::operator=(Slic&&) noexcept = default;
 SuperpixelMap Slic::cluster(const cv::Mat& image, const ImageSize& map_size,
                             std::optional<StampNs> stamp) {
   if (image.empty() || (image.type() != CV_8UC1 && image.type() != CV_8UC3)) {
-    throw DataError("image is " + std::to_string(image.cols) + "x" + std::to_string(image.rows) +
-                    " of OpenCV type " + std::to_string(image.type()) +
-                    ", must be non-empty 8UC1 or 8UC3 (BGR)");
+    throw DataError("image is " + sizeText({image.cols, image.rows}) + " of OpenCV type " +
+                    std::to_string(image.type()) + ", must be non-empty 8UC1 or 8UC3 (BGR)");
   }
   if (map_size.width < 1 || map_size.height < 1) {
-    throw DataError("superpixel map size is " + std::to_string(map_size.width) + "x" +
-                    std::to_string(map_size.height) + ", must be at least 1x1");
+    throw DataError("superpixel map size is " + sizeText(map_size) + ", must be at least 1x1");
   }
   return engine_->cluster(image, map_size, stamp);
 }

@@ -13,10 +13,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-std::string sizeText(int width, int height) {
-  return std::to_string(width) + "x" + std::to_string(height);
-}
-
 void checkClassCount(int class_count) {
   if (class_count < 1 || class_count > CV_CN_MAX) {
     throw DataError("class count is " + std::to_string(class_count) + ", must be 1.." +
@@ -182,7 +178,7 @@ cv::Mat denseProbabilities(const ScoreMap& scores, const cv::Mat& share,
                            const UncertaintyConfig& config) {
   if (scores.empty()) throw DataError("score map is empty, must have at least one cell");
   if (share.empty() || share.type() != CV_32FC1) {
-    throw DataError("share image is " + sizeText(share.cols, share.rows) + " of OpenCV type " +
+    throw DataError("share image is " + sizeText({share.cols, share.rows}) + " of OpenCV type " +
                     std::to_string(share.type()) + ", must be non-empty 32FC1");
   }
   const int class_count = scores.classCount();
@@ -211,7 +207,7 @@ cv::Mat histogramProbabilities(const SuperpixelMap& superpixels, const cv::Mat& 
                                int class_count) {
   checkClassCount(class_count);
   if (labels.empty() || labels.type() != CV_8UC1) {
-    throw DataError("label image is " + sizeText(labels.cols, labels.rows) + " of OpenCV type " +
+    throw DataError("label image is " + sizeText({labels.cols, labels.rows}) + " of OpenCV type " +
                     std::to_string(labels.type()) + ", must be non-empty 8UC1 (mono8)");
   }
   const auto label_row = [&](int row, int* row_labels) {

@@ -5,13 +5,13 @@
 #include <fstream>
 #include <sstream>
 
-#include "edge/fusion_chain.h"
 #include "edge/lidar_decoder.h"
 #include "fuzz_target.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 #include "semantic_lidar_fusion/config/rig.h"
-#include "semantic_lidar_fusion/fusion/camera_semantics.h"
+#include "semantic_lidar_fusion/fusion/camera_superpixels.h"
+#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 
 namespace semantic_lidar_fusion {
@@ -61,11 +61,8 @@ void use(const Rig& rig) {
   ScanSelector selector(rig.selectorConfig());
   LidarDecoder lidar(rig.lidar, [](const std::string&, std::uint64_t) {});
   if (rig.classes.size() > 0) SemanticProjector projector(fusionConfig(rig));
-  for (const CameraConfig& camera : rig.cameras) {
-    CameraSemantics semantics(rig.superpixels, rig.classes.size(), camera.score_format);
-    const auto map = semantics.mapSize({1920, 1208});
-    expect(!map || (map->width >= 1 && map->height >= 1), "a superpixel map has pixels");
-  }
+  const auto map = CameraSuperpixels(rig.superpixels).mapSize({1920, 1208});
+  expect(!map || (map->width >= 1 && map->height >= 1), "a superpixel map has pixels");
   parseYaml(rig.classes.toJson(), "class_info");
 }
 

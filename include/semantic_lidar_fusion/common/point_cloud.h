@@ -2,6 +2,7 @@
 /// Lidar clouds as structures of arrays; all arrays of one cloud have equal length.
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <string>
@@ -62,6 +63,9 @@ struct Cloud {
   bool empty() const { return x.empty(); }
   void resize(std::size_t points);
 };
+
+/// How many points have each PointStatus, by its value; a value that is none counts as the last.
+std::array<std::uint64_t, kPointStatusNames.size()> countByStatus(const Cloud& cloud);
 
 /// A rigid cloud with what the cameras say of each point.
 struct SemanticCloud {

@@ -10,8 +10,10 @@
 #pragma once
 
 #include <Eigen/Geometry>
+#include <array>
 #include <cmath>
 #include <cstdint>
+#include <string>
 
 namespace semantic_lidar_fusion {
 
@@ -19,6 +21,7 @@ using StampNs = std::int64_t;
 using Transform = Eigen::Isometry3d;
 
 constexpr StampNs kNsPerSecond = 1000000000;
+constexpr double kPi = 3.14159265358979323846;
 
 inline double toSeconds(StampNs duration_ns) { return static_cast<double>(duration_ns) * 1e-9; }
 /// Nearest nanosecond.
@@ -34,6 +37,11 @@ struct ImageSize {
   }
   bool operator!=(const ImageSize& other) const { return !(*this == other); }
 };
+
+/// "1920x1208".
+inline std::string sizeText(const ImageSize& size) {
+  return std::to_string(size.width) + "x" + std::to_string(size.height);
+}
 
 /// Index of the pixel that holds the real coordinate `u`: floor(u + 0.5), also left of the image.
 inline int pixelIndex(double u) {
@@ -64,6 +72,9 @@ enum class PointStatus : std::uint8_t {
   kNoImage = 3,
   kNoOdometry = 4,
 };
+/// By the value of PointStatus, for people.
+constexpr std::array<const char*, 5> kPointStatusNames = {"fused", "occluded", "outside",
+                                                          "no image", "no odometry"};
 
 /// The `label` of a point without a distribution.
 constexpr std::uint8_t kNoLabel = 255;

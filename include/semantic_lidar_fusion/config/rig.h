@@ -12,11 +12,11 @@
 #include <vector>
 
 #include "semantic_lidar_fusion/common/label_set.h"
-#include "semantic_lidar_fusion/fusion/camera_merger.h"
+#include "semantic_lidar_fusion/config/overlap_rule.h"
 #include "semantic_lidar_fusion/lidar/packet.h"
 #include "semantic_lidar_fusion/lidar/point_cloud_reader.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
-#include "semantic_lidar_fusion/projection/occlusion_mask.h"
+#include "semantic_lidar_fusion/projection/occlusion_config.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 

@@ -6,17 +6,11 @@
 #include <vector>
 
 #include "semantic_lidar_fusion/common/point_cloud.h"
+#include "semantic_lidar_fusion/config/overlap_rule.h"
 
 namespace semantic_lidar_fusion {
 
 class ThreadPool;
-
-enum class OverlapRule : std::uint8_t {
-  kMean,           ///< arithmetic mean of the distributions
-  kProduct,        ///< normalised product; independent evidence
-  kNearestInTime,  ///< smallest |t_point - t_image|, ties averaged
-  kMostCentral,    ///< smallest angle from the optical axis, ties averaged
-};
 
 /// One camera's distributions of its visible points.
 struct CameraVotes {

@@ -38,13 +38,10 @@ std::string count(std::uint64_t n, const std::string& thing) {
 void checkSize(const SegmentedImage& image, const ImageSize& wanted) {
   if (image.image.empty()) return;
   if (image.image.cols != wanted.width || image.image.rows != wanted.height) {
-    throw DataError("is " + std::to_string(image.image.cols) + "x" +
-                    std::to_string(image.image.rows) + "; camera_info says " +
-                    std::to_string(wanted.width) + "x" + std::to_string(wanted.height));
+    throw DataError("is " + sizeText({image.image.cols, image.image.rows}) + "; camera_info says " +
+                    sizeText(wanted));
   }
 }
-
-const char* const kStatusNames[] = {"fused", "occluded", "outside", "no image", "no odometry"};
 
 }  // namespace
 
@@ -53,7 +50,7 @@ BagFusion::BagFusion(const FuseBagOptions& options, void (*checkpoint)())
       checkpoint_(checkpoint),
       started_(std::chrono::steady_clock::now()),
       rig_(loadRig(options.rig, options.overrides)),
-      chain_(rig_),
+      pipeline_(rig_),
       lidar_(rig_.lidar,
              [this](const std::string& reason, std::uint64_t n) {
                if (counts_points_) drops_.add("lidar: " + reason, n);
@@ -129,26 +126,34 @@ void BagFusion::measureScans() {
   if (lidar_.timeDecisionIsDoubtful()) DropLog::warn("lidar: " + lidar_.timeDecision());
 }
 
-/// An image can be chosen if what its camera contributes is there.
-bool BagFusion::isCandidate(std::size_t camera, StampNs stamp) const {
+/// The images of a camera that can be chosen, by true time: where the bag has no scores of the
+/// camera, the rig's network makes them.
+std::map<StampNs, StampNs> BagFusion::candidates(std::size_t camera) const {
   const CameraTrack& track = index_.cameras[camera];
-  if (track.has_semantics) return track.semantics.count(stamp) > 0;
-  return rig_.cameras[camera].input == CameraInput::kScores && !rig_.segmentation.model.empty();
+  const CameraConfig& config = rig_.cameras[camera];
+  const bool made_on_request = !track.has_semantics && config.input == CameraInput::kScores &&
+                               !rig_.segmentation.model.empty();
+  std::map<StampNs, StampNs> result;
+  for (const MessagesByStamp* messages : {&track.images, &track.semantics}) {
+    for (const auto& message : *messages) {
+      const StampNs stamp = message.first;
+      const ImageParts parts{track.images.count(stamp) > 0, track.semantics.count(stamp) > 0};
+      if (!isCandidate(config.input, parts, made_on_request)) continue;
+      result[pipeline_.imageTime(camera, stamp)] = stamp;
+    }
+  }
+  return result;
 }
 
 /// Each scan is decided with all stamps that may matter to it, as if nothing more would come: the
 /// selector's bounds on memory and its timeouts, made for a live stream, do not touch the result.
 void BagFusion::select() {
   SelectorConfig config = rig_.selectorConfig();
-  std::vector<std::map<StampNs, StampNs>> candidates(rig_.cameras.size());  // true time -> stamp
+  std::vector<std::map<StampNs, StampNs>> images;  // of each camera
   StampNs reach_ns = config.reference_timeout_ns;
   for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
-    const CameraTrack& track = index_.cameras[c];
     reach_ns = std::max(reach_ns, config.cameras[c].max_time_difference_ns);
-    for (const auto& image : track.has_images ? track.images : track.semantics) {
-      if (!isCandidate(c, image.first)) continue;
-      candidates[c][image.first + config.cameras[c].time_offset_ns] = image.first;
-    }
+    images.push_back(candidates(c));
   }
   config.image_history_ns = std::numeric_limits<StampNs>::max() / 4;
   std::set<StampNs> seen;
@@ -169,10 +174,9 @@ void BagFusion::select() {
     ScanSelector selector(config);
     selector.addScan(scan.times, 0);
     // t_ref is at most `reach_ns` off the scan, an image at most that off t_ref.
-    for (std::size_t c = 0; c < candidates.size(); ++c) {
-      for (auto image = candidates[c].lower_bound(interval.first_ns - 2 * reach_ns);
-           image != candidates[c].end() && image->first <= interval.last_ns + 2 * reach_ns;
-           ++image) {
+    for (std::size_t c = 0; c < images.size(); ++c) {
+      for (auto image = images[c].lower_bound(interval.first_ns - 2 * reach_ns);
+           image != images[c].end() && image->first <= interval.last_ns + 2 * reach_ns; ++image) {
         selector.addImage(static_cast<int>(c), image->second);
       }
     }
@@ -213,12 +217,8 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
                           : std::nullopt;
   const PoseBuffer& odometry = poses_.odometry();
 
-  CompensationResult rigid;
-  if (raw.empty()) {
-    rigid.cloud = chain_.emptyCloud(raw);
-  } else {
-    rigid = chain_.compensated(raw, scan.reference_ns, odometry, T_vehicle_lidar);
-  }
+  const CompensationResult rigid =
+      pipeline_.compensate(raw, scan.reference_ns, odometry, T_vehicle_lidar);
 
   std::vector<CameraView> views;
   std::vector<std::shared_ptr<const SegmentedImage>> images(camera_count);
@@ -229,9 +229,9 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
     const ros::Time info_time =
         image == images_by_stamp.end() ? scan.message->getTime() : image->second.getTime();
     const CameraPlace at = place(c, info_time, raw.frame_id);
-    if (stamp && at.model && !raw.empty()) images[c] = segmentedImage(c, *stamp, at, output);
+    if (stamp && at.model) images[c] = segmentedImage(c, *stamp, at, output);
     views.push_back(
-        chain_.view(c, at, images[c].get(), scan.reference_ns, odometry, T_vehicle_lidar));
+        pipeline_.view(c, at, images[c].get(), scan.reference_ns, odometry, T_vehicle_lidar));
     CameraState& state = cameras_[c];
     if (views.back().has_image) {
       ++state.used;
@@ -246,7 +246,7 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
       ++state.none;
     }
   }
-  const FusionResult result = chain_.fused(rigid.cloud, views, options_.all);
+  const FusionResult result = pipeline_.fuse(rigid.cloud, views, options_.all);
   const auto compensated = compensatedCloudMessage(rigid.cloud);
   const auto semantic = semanticCloudMessage(result.cloud, rig_.classes);
 
@@ -265,9 +265,8 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
 
   points_.decoded += raw.size();
   points_.written += result.cloud.size();
-  for (const std::uint8_t status : result.cloud.points.status) {
-    ++points_.by_status[std::min<std::size_t>(status, points_.by_status.size() - 1)];
-  }
+  const auto by_status = countByStatus(result.cloud.points);
+  for (std::size_t s = 0; s < by_status.size(); ++s) points_.by_status[s] += by_status[s];
   if (!rigid.counters.reference_covered) {
     drops_.count("scans: odometry does not cover t_ref",
                  poses_.gap(scan.reference_ns, scan.reference_ns));
@@ -350,7 +349,7 @@ std::shared_ptr<const SegmentedImage> BagFusion::segmentedImage(std::size_t came
   try {
     const std::shared_ptr<SegmentedImage> image = loadImage(camera, stamp);
     checkSize(*image, place.model->imageSize());
-    chain_.segment(camera, image.get());
+    pipeline_.segment(camera, image.get());
     if (!image->note.empty() && told_notes_.insert(image->note).second && !options_.quiet) {
       DropLog::note(image->note);
     }
@@ -410,13 +409,11 @@ void BagFusion::writeImageProducts(std::size_t camera, const SegmentedImage& ima
     }
   };
   if (image.from_network) write("scores", image.input);
-  write("superpixels", image.superpixel_ids);
+  write("superpixels", image.superpixels.ids);
   write("share", image.share);
-  write("probabilities", image.share.empty() ? image.semantics.probabilities
-                                             : denseProbabilities(image.semantics.scores,
-                                                                  image.share, rig_.uncertainty));
+  write("probabilities", pipeline_.probabilities(image));
   if (!image.share.empty()) {
-    write("uncertainty_overlay", drawUncertainty(image.image, image.superpixel_ids, image.share));
+    write("uncertainty_overlay", drawUncertainty(image.image, image.superpixels.ids, image.share));
   }
 }
 
@@ -449,7 +446,7 @@ std::string BagFusion::summary() const {
   std::string text = options_.output + ": " + count(scans_written_, "scan") + " of " +
                      std::to_string(scans_.size()) + ", " + count(points_.written, "point") + " (";
   for (std::size_t s = 0; s < points_.by_status.size(); ++s) {
-    text += (s ? ", " : "") + std::string(kStatusNames[s]) + " " +
+    text += (s ? ", " : "") + std::string(kPointStatusNames[s]) + " " +
             percent(points_.by_status[s], points_.written);
   }
   text += ")\n";

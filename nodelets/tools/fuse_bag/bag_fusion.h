@@ -14,9 +14,9 @@
 #include <string>
 #include <vector>
 
-#include "edge/fusion_chain.h"
 #include "edge/lidar_decoder.h"
 #include "edge/tf_pose_source.h"
+#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 #include "tools/common/bag_input.h"
 #include "tools/common/bag_output.h"
@@ -55,7 +55,7 @@ class BagFusion {
   struct PointCounters {
     std::uint64_t decoded = 0;
     std::uint64_t written = 0;
-    std::array<std::uint64_t, 5> by_status{};
+    std::array<std::uint64_t, kPointStatusNames.size()> by_status{};
   };
 
   void fuseInto(BagOutput* output);
@@ -66,7 +66,7 @@ class BagFusion {
   void copyTransforms(BagOutput* output);
 
   TimedCloud decode(const rosbag::MessageInstance& message);
-  bool isCandidate(std::size_t camera, StampNs stamp) const;
+  std::map<StampNs, StampNs> candidates(std::size_t camera) const;
   CameraPlace place(std::size_t camera, const ros::Time& time, const std::string& lidar_frame);
   std::shared_ptr<const CameraModel> model(std::size_t camera, const CameraInfo& info);
   std::optional<Transform> extrinsics(const std::string& target, const std::string& source,
@@ -86,7 +86,7 @@ class BagFusion {
   DropLog drops_;
   bool counts_points_ = true;  ///< scans are decoded twice, their points are counted once
   Rig rig_;
-  FusionChain chain_;
+  ScanPipeline pipeline_;
   LidarDecoder lidar_;
   BagInput input_;
   TfPoseSource poses_;

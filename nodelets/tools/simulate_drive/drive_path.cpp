@@ -8,7 +8,6 @@ namespace semantic_lidar_fusion {
 namespace simulator {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr double kStepS = 1e-3;
 constexpr double kLongestCycleS = 10.0;
 // Parts of a cycle.

@@ -23,8 +23,8 @@
 #include <vector>
 
 #include "edge/conversions.h"
-#include "edge/fusion_chain.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/lidar/packet_decoder.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 #include "tools/common/bag_output.h"

@@ -13,7 +13,6 @@ namespace semantic_lidar_fusion {
 namespace simulator {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr double kStartAzimuthRad = kPi;  // the seam is behind the vehicle
 constexpr double kMaxRangeM = 100.0;
 constexpr double kMinRangeM = 0.5;

@@ -7,7 +7,7 @@ namespace semantic_lidar_fusion {
 namespace simulator {
 namespace {
 
-constexpr double kRadPerDeg = 3.14159265358979323846 / 180.0;
+constexpr double kRadPerDeg = kPi / 180.0;
 
 struct Mount {
   const char* name;

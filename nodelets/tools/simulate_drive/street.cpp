@@ -13,7 +13,6 @@ namespace {
 
 using Eigen::Vector3f;
 
-constexpr double kPi = 3.14159265358979323846;
 // Across the road, m to the left of the lane's middle.
 constexpr double kRoadLeft = 3.85, kRoadRight = -7.35;
 constexpr double kParkingWidth = 2.1;

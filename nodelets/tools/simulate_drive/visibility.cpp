@@ -11,15 +11,15 @@ namespace semantic_lidar_fusion {
 namespace simulator {
 namespace {
 
-constexpr float kPi = 3.14159265358979323846F;
-constexpr float kRingRad = 2.0F * kPi / 180.0F;
+constexpr float kPiF = static_cast<float>(kPi);
+constexpr float kRingRad = 2.0F * kPiF / 180.0F;
 /// A camera sees a point if its ray meets nothing this much before it: share of the range, and m.
 constexpr double kSeenShare = 1e-4, kSeenM = 2e-3;
 /// A silhouette is a step in depth of at least this, m.
 constexpr double kSilhouetteM = 0.3;
 
 float azimuthStepRad() {
-  return static_cast<float>(2.0 * kPi * kLidarTurnsPerS *
+  return static_cast<float>(2.0 * kPiF * kLidarTurnsPerS *
                             toSeconds(firingTimes(LidarModel::kVlp16).firing_ns));
 }
 
@@ -70,7 +70,7 @@ bool ReturnsAround::tellOf(int object, const Eigen::Vector3d& p_world, const Eig
                            double distance) const {
   const Eigen::Vector2f way = direction(p_world);
   const float step = azimuthStepRad();
-  for (const float turn : {0.0F, -2.0F * kPi, 2.0F * kPi}) {
+  for (const float turn : {0.0F, -2.0F * kPiF, 2.0F * kPiF}) {
     const float first = way.x() + turn - step, last = way.x() + turn + step;
     auto found = std::lower_bound(
         returns_.begin(), returns_.end(), first, [&](const Return& r, float azimuth) {

@@ -13,7 +13,7 @@ namespace simulator {
 namespace {
 
 constexpr double kLongestStepS = 0.004;
-constexpr float kPi = 3.14159265F;
+constexpr float kPiF = static_cast<float>(kPi);
 
 void setTransform(RTCGeometry geometry, unsigned step, const Transform& T) {
   float columns[12];
@@ -98,8 +98,8 @@ void Mesh::tube(const Eigen::Vector3f& from, const Eigen::Vector3f& to, float fr
   const Eigen::Vector3f p = axis.unitOrthogonal();
   const Eigen::Vector3f q = axis.cross(p);
   for (int i = 0; i < sides; ++i) {
-    const float a = 2.0F * kPi * static_cast<float>(i) / static_cast<float>(sides);
-    const float b = 2.0F * kPi * static_cast<float>(i + 1) / static_cast<float>(sides);
+    const float a = 2.0F * kPiF * static_cast<float>(i) / static_cast<float>(sides);
+    const float b = 2.0F * kPiF * static_cast<float>(i + 1) / static_cast<float>(sides);
     const Eigen::Vector3f first = std::cos(a) * p + std::sin(a) * q;
     const Eigen::Vector3f second = std::cos(b) * p + std::sin(b) * q;
     quad(from + from_radius * first, from + from_radius * second, to + to_radius * second,
@@ -112,8 +112,8 @@ void Mesh::tube(const Eigen::Vector3f& from, const Eigen::Vector3f& to, float fr
 void Mesh::ellipsoid(const Eigen::Vector3f& centre, const Eigen::Vector3f& radii, int sides,
                      Class kind, Material material) {
   const auto point = [&](int i, int j) {
-    const float polar = kPi * static_cast<float>(j) / static_cast<float>(sides);
-    const float azimuth = 2.0F * kPi * static_cast<float>(i) / static_cast<float>(sides);
+    const float polar = kPiF * static_cast<float>(j) / static_cast<float>(sides);
+    const float azimuth = 2.0F * kPiF * static_cast<float>(i) / static_cast<float>(sides);
     const Eigen::Vector3f unit(std::sin(polar) * std::cos(azimuth),
                                std::sin(polar) * std::sin(azimuth), std::cos(polar));
     return Eigen::Vector3f(centre + radii.cwiseProduct(unit));

@@ -77,23 +77,6 @@ TEST_P(EveryMotionKernel, WritesTheTimeOfAFirstPointThatIsOutside) {
   }
 }
 
-TEST_P(EveryMotionKernel, SpansAllTimes) {
-  std::mt19937_64 random(7);
-  for (const int count : kCounts) {
-    if (count == 0) continue;
-    for (int trial = 0; trial < 50; ++trial) {
-      auto times = array<std::int64_t>(count);
-      for (int i = 0; i < count; ++i) times[i] = static_cast<std::int64_t>(random());
-      if (trial == 0) times[count / 2] = std::numeric_limits<std::int64_t>::min();
-      if (trial == 1) times[count / 2] = std::numeric_limits<std::int64_t>::max();
-      std::int64_t first = 0, last = 0;
-      GetParam()->span(times.get(), count, &first, &last);
-      EXPECT_EQ(first, *std::min_element(times.get(), times.get() + count));
-      EXPECT_EQ(last, *std::max_element(times.get(), times.get() + count));
-    }
-  }
-}
-
 /// The equations in double precision, and the plain kernel byte for byte.
 TEST_P(EveryMotionKernel, MovesPoints) {
   std::mt19937 random(5);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-/// From the images of one camera to the semantics that are transferred: superpixels, then share.
+/// Superpixels of one camera's images, after the rig file.
 #pragma once
 
 #include <opencv2/core.hpp>
@@ -9,14 +9,14 @@
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/superpixel/slic.h"
 #include "semantic_lidar_fusion/superpixel/superpixel_map.h"
-#include "semantic_lidar_fusion/superpixel/uncertainty.h"
 
 namespace semantic_lidar_fusion {
 
 /// Superpixels of one camera's images, in the order in which the images are given. Not thread-safe.
-class CameraSemantics {
+class CameraSuperpixels {
  public:
-  CameraSemantics(const SuperpixelConfig& config, int class_count, const ScoreFormat& format);
+  /// Throws ConfigError.
+  explicit CameraSuperpixels(const SuperpixelConfig& config);
 
   /// Size of the superpixel map of an image: floor(image * scale), at least 1 x 1; without a scale
   /// the size of the scores, which is empty until scores were seen.
@@ -30,13 +30,8 @@ class CameraSemantics {
   /// depends on the image before, if it is recent. Throws DataError.
   SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size, StampNs stamp);
 
-  /// `scores` as in ScoreMap. Throws DataError.
-  ShareMap share(const SuperpixelMap& superpixels, const cv::Mat& scores) const;
-
  private:
   SuperpixelConfig config_;
-  int class_count_;
-  ScoreFormat format_;
   std::optional<ImageSize> scores_size_;
   Slic slic_;
 };
