@@ -219,7 +219,7 @@ def main():
     options = parser.parse_args()
     if options.dataset is None:
         parser.error("name a data set: kitti, semantickitti, rellis or usyd")
-    cli.require("numpy", "yaml", "rosbag", "sensor_msgs.msg", "tf2_msgs.msg")
+    cli.require("numpy", "scipy", "yaml", "rosbag", "sensor_msgs.msg", "tf2_msgs.msg")
     from semantic_lidar_fusion.datasets import writer
     from semantic_lidar_fusion.labels import LabelSet, package_file
 

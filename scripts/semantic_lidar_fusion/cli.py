@@ -7,7 +7,10 @@ after parsing, so that `--help` works everywhere.
 
 import argparse
 import os
+import signal
 import sys
+import traceback
+from types import FrameType
 from typing import Callable, Iterable, Iterator, Optional, TypeVar
 
 from semantic_lidar_fusion.errors import MissingDependencyError, SemanticLidarFusionError
@@ -15,23 +18,104 @@ from semantic_lidar_fusion.errors import MissingDependencyError, SemanticLidarFu
 T = TypeVar("T")
 
 
-def run(main: Callable[[], Optional[int]]) -> None:
-    """Runs a command and leaves the interpreter: 0 on success, 1 with one line for known errors,
-    130 when interrupted; an unknown error shows its trace (and 1)."""
+class Ended(BaseException):
+    """A signal that asks for the end; raised wherever the program is, so that temporary files go."""
+
+    def __init__(self, number: int):
+        super().__init__(number)
+        self.number = number
+
+
+def _end(number: int, frame: Optional[FrameType]) -> None:
+    raise Ended(number)
+
+
+def _take_signals() -> None:
+    """SIGTERM and SIGHUP end the program as Ctrl-C does; what nohup ignores stays ignored."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _end)
+
+
+def _open_standard_streams() -> None:
+    """A standard stream that the caller has closed becomes /dev/null: a file that is opened later
+    must not get its number, and with it what is printed."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdin = sys.stdin or open(os.devnull)
+    sys.stdout = sys.stdout or open(os.devnull, "w")
+    sys.stderr = sys.stderr or open(os.devnull, "w")
+
+
+def _forget_stdout() -> None:
+    """Nobody takes what is still in its buffer; Python must not try again when it leaves."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def _say(text: str) -> None:
+    """One line on stderr, which may itself be closed or full."""
     name = os.path.basename(sys.argv[0])
     try:
-        code = main() or 0
+        print("%s: %s" % (name, " ".join(text.split())), file=sys.stderr, flush=True)
+    except (OSError, ValueError):
+        pass
+
+
+def _where(error: BaseException) -> str:
+    """The last place of this package that an error passed: file:line."""
+    places = traceback.extract_tb(error.__traceback__)
+    package = os.path.dirname(os.path.abspath(__file__))
+    ours = [p for p in places if p.filename.startswith(package) and p.filename != __file__]
+    ours = ours or places
+    return "%s:%d" % (os.path.basename(ours[-1].filename), ours[-1].lineno or 0)
+
+
+def run(main: Callable[[], Optional[int]]) -> None:
+    """Runs a command and leaves the interpreter: 0 on success, 1 with one line for errors, 128 + its
+    number after a signal. An error that nobody foresaw is one line too, with its place; its trace is
+    shown where the variable SLF_TRACEBACK is set."""
+    _open_standard_streams()
+    _take_signals()
+    try:
+        if "--version" in sys.argv[1:]:
+            from semantic_lidar_fusion.installation import version
+
+            print("%s %s" % (os.path.basename(sys.argv[0]), version()))
+            code = 0
+        else:
+            code = main() or 0
         sys.stdout.flush()
     except SemanticLidarFusionError as error:
-        print("%s: error: %s" % (name, error), file=sys.stderr)
+        _say("error: %s" % error)
         code = 1
     except KeyboardInterrupt:
-        print("%s: interrupted" % name, file=sys.stderr)
+        _say("interrupted")
         code = 130
+    except Ended as ended:
+        _say("ended by %s" % signal.Signals(ended.number).name)
+        code = 128 + ended.number
     except BrokenPipeError:
-        # The reader of our output has left; Python must not try to flush to it again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _forget_stdout()
         code = 141
+    except OSError as error:
+        what = error.filename if error.filename is not None else "stdout"
+        _say("error: %s: %s" % (what, error.strerror or error))
+        _forget_stdout()
+        code = 1
+    except MemoryError:
+        _say("error: not enough memory")
+        code = 1
+    except Exception as error:
+        if os.environ.get("SLF_TRACEBACK"):
+            traceback.print_exc()
+        _say(
+            "error: unexpected %s at %s: %s (SLF_TRACEBACK=1 shows the trace)"
+            % (type(error).__name__, _where(error), error)
+        )
+        code = 1
     sys.exit(code)
 
 

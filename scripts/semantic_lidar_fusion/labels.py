@@ -6,14 +6,17 @@ color: [r, g, b], dynamic} whose position is the class id, and `evaluation: {dis
 merge: {merged_name: [names]}}`.
 """
 
-import os
 import re
 from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 import yaml
 
-from semantic_lidar_fusion.errors import ConfigError
+from semantic_lidar_fusion.errors import ConfigError, DataError
+from semantic_lidar_fusion.files import open_file
+from semantic_lidar_fusion.installation import package_file
+
+__all__ = ["ClassInfo", "LabelSet", "MergedClass", "load_yaml", "package_file", "parse_yaml"]
 
 NO_LABEL = 255  # label of a point without a class
 MAX_CLASSES = 255
@@ -65,8 +68,10 @@ class LabelSet:
         return result
 
     @staticmethod
-    def from_class_info(tree: Dict[str, Any]) -> "LabelSet":
+    def from_class_info(tree: Any) -> "LabelSet":
         """From the parsed JSON of the `class_info` topic."""
+        if not isinstance(tree, dict):
+            raise ConfigError("class_info: must be a mapping")
         evaluation = {"discard": tree.get("discard", []), "merge": tree.get("merge", {})}
         return LabelSet.from_tree(
             {"classes": tree.get("classes"), "evaluation": evaluation}, "class_info"
@@ -166,31 +171,31 @@ _UniqueKeyLoader.add_constructor(
 )
 
 
+MAX_YAML_BYTES = 1 << 20
+
+
+def parse_yaml(data: bytes, source: str) -> Any:
+    """The one YAML document of `data` as plain values; ConfigError names `source` and the line."""
+    if len(data) > MAX_YAML_BYTES:
+        raise ConfigError("%s: is longer than %d bytes" % (source, MAX_YAML_BYTES))
+    try:
+        return yaml.load(data.decode("utf-8"), Loader=_UniqueKeyLoader)
+    except RecursionError as error:
+        raise ConfigError("%s: nests too deeply" % source) from error
+    # Values that only look like a date or a number end in errors of the constructors.
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        text = " ".join(str(error).split())
+        raise ConfigError("%s: not readable as YAML: %s" % (source, text)) from error
+
+
 def load_yaml(path: str) -> Any:
     """A YAML file as plain values; ConfigError names the file and the line."""
     try:
-        with open(path, encoding="utf-8") as file:
-            return yaml.load(file, Loader=_UniqueKeyLoader)
-    except OSError as error:
-        raise ConfigError("%s: %s" % (path, error.strerror or error)) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        text = " ".join(str(error).split())
-        raise ConfigError("%s: not readable as YAML: %s" % (path, text)) from error
-
-
-def package_file(relative: str) -> str:
-    """Path of a file that the package ships, in the source tree or the install space."""
-    here = os.path.dirname(os.path.abspath(__file__))
-    path = os.path.normpath(os.path.join(here, "..", "..", relative))
-    if os.path.exists(path):
-        return path
-    try:
-        import rospkg
-
-        share = rospkg.RosPack().get_path("semantic_lidar_fusion")
-    except Exception as error:
-        raise ConfigError("%s: not found beside %s, nor by rospack" % (relative, here)) from error
-    return os.path.join(share, relative)
+        with open_file(path) as file:
+            data = file.read(MAX_YAML_BYTES + 1)
+    except DataError as error:
+        raise ConfigError(str(error)) from error
+    return parse_yaml(data, path)
 
 
 def _is_whole(value: Any, low: int, high: int) -> bool:

@@ -1,17 +1,25 @@
 # SPDX-License-Identifier: MIT
 """Bags: reading by topic and type, velodyne messages without their package, atomic writing."""
 
+import io
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rosbag")
+from geometry_msgs.msg import TransformStamped  # noqa: E402
 from sensor_msgs.msg import Image  # noqa: E402
 from std_msgs.msg import Int32, String  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
 
+from conftest import SOURCE_DIR  # noqa: E402
+from semantic_lidar_fusion import files  # noqa: E402
 from semantic_lidar_fusion.bags import bag_io  # noqa: E402
-from semantic_lidar_fusion.errors import DataError  # noqa: E402
+from semantic_lidar_fusion.errors import ConfigError, DataError  # noqa: E402
+from semantic_lidar_fusion.labels import load_yaml  # noqa: E402
 
 
 def write_sample(path, count=4):
@@ -133,18 +141,102 @@ def test_unwritable_places(tmp_path):
 def test_full_disk(tmp_path, monkeypatch):
     class Full(bag_io.AtomicFile):
         def __init__(self, path):
-            self.path, self.temporary = path, "/dev/full"
+            self.path, self.temporary, self._lock = path, "/dev/full", -1
 
         def discard(self):
             pass
 
     monkeypatch.setattr(bag_io, "AtomicFile", Full)
+    monkeypatch.setattr(files, "AtomicFile", Full)
     with pytest.raises(DataError, match="cannot be written .*No space left"):
         with bag_io.BagWriter(str(tmp_path / "a.bag")) as writer:
             for i in range(200):
                 writer.write("/text", String("x" * 10000), i + 1)
     with pytest.raises(DataError, match="cannot be written .*No space left"):
         bag_io.write_text(str(tmp_path / "a.yaml"), "text")
+
+
+def test_a_name_of_its_own_and_no_link_followed(tmp_path):
+    target = str(tmp_path / "a.txt")
+    first, second = files.AtomicFile(target), files.AtomicFile(target)
+    assert first.temporary != second.temporary
+    with open(first.temporary, "w") as file:
+        file.write("first")
+    second.discard()
+    second.discard()
+    # The name itself may be a link: it is replaced, and what it pointed to stays as it is.
+    (tmp_path / "other").write_text("untouched")
+    os.symlink(str(tmp_path / "other"), target)
+    first.commit()
+    first.discard()
+    assert sorted(os.listdir(str(tmp_path))) == ["a.txt", "other"]
+    assert (tmp_path / "other").read_text() == "untouched"
+    assert open(target).read() == "first" and not os.path.islink(target)
+
+
+def test_what_a_killed_run_left_is_removed_and_named(tmp_path, capfd):
+    target = str(tmp_path / "a.txt")
+    program = (
+        "import sys, os, signal; sys.path.insert(0, %r)\n"
+        "from semantic_lidar_fusion.files import AtomicFile\n"
+        "file = AtomicFile(%r); os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    scripts = os.path.join(SOURCE_DIR, "scripts")
+    subprocess.run([sys.executable, "-c", program % (scripts, target)])
+    (left,) = os.listdir(str(tmp_path))
+    users = tmp_path / ".a.txt.mine.partial"
+    users.write_text("a file that nobody here has made")
+    running = files.AtomicFile(target)
+    err = capfd.readouterr().err
+    assert left in err and "removed" in err and err.count("\n") == 1
+    files.write_text(target, "whole")
+    # Neither that of the other writer, which still runs, nor the user's own.
+    assert os.path.exists(running.temporary) and users.exists()
+    running.discard()
+    assert capfd.readouterr().err == ""
+    assert sorted(os.listdir(str(tmp_path))) == [".a.txt.mine.partial", "a.txt"]
+
+
+@pytest.mark.parametrize("make", [lambda p: os.mkfifo(p), lambda p: os.symlink("/dev/zero", p)])
+def test_pipes_and_devices_are_no_files(tmp_path, make):
+    path = str(tmp_path / "pipe")
+    make(path)
+    for read in (bag_io.BagReader, files.open_file, load_yaml):
+        with pytest.raises((DataError, ConfigError), match="pipe: must be a file"):
+            read(path)
+    with pytest.raises(DataError, match="is a pipe or a device"):
+        files.AtomicFile(path)
+
+
+def test_whatever_a_damaged_bag_raises_is_a_data_error(tmp_path):
+    path = str(tmp_path / "a.bag")
+    message = TFMessage([TransformStamped(child_frame_id="lidar")])
+    stream = io.BytesIO()
+    message.serialize(stream)
+    content = stream.getvalue()
+    with bag_io.BagWriter(path, "none") as writer:
+        writer.write("/tf", message, 1)
+        writer.write("/text", String("text"), 1)
+    with open(path, "rb") as file:
+        data = file.read()
+    # A list that claims to be longer than its message; a foreign type whose declaration is none.
+    no_end = data.replace(content, b"\xff" + content[1:])
+    foreign = data.replace(b"std_msgs/", b"odd_msgs/").replace(b"string data", b"strong data")
+    for damaged in (no_end, foreign):
+        assert damaged != data
+        with open(path, "wb") as file:
+            file.write(damaged)
+        with bag_io.BagReader(path) as bag, pytest.raises(DataError, match="damaged"):
+            list(bag.read())
+        with bag_io.BagReader(path) as bag, pytest.raises(DataError, match="damaged"):
+            for item in bag.read_raw():
+                item.message()
+    # What the reader of the messages raises is its own error.
+    with open(path, "wb") as file:
+        file.write(data)
+    with bag_io.BagReader(path) as bag, pytest.raises(ZeroDivisionError):
+        for _ in bag.read():
+            1 // 0
 
 
 def test_bad_bags(tmp_path):

@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Commands: help without ROS, one-line errors, exit codes."""
 
+import glob
 import os
+import re
+import shlex
+import signal
 import subprocess
 import sys
 
@@ -76,9 +80,101 @@ def test_known_errors_are_one_line(capsys):
     assert err.endswith(": error: file.bin: no such file\n") and err.count("\n") == 1
 
 
-def test_unknown_errors_show_their_trace():
-    with pytest.raises(ZeroDivisionError):
-        cli.run(lambda: 1 // 0)
+def test_unknown_errors_are_one_line_with_their_place(capsys, monkeypatch):
+    monkeypatch.delenv("SLF_TRACEBACK", raising=False)
+    code, err = leave(lambda: 1 // 0, capsys)
+    assert code == 1 and err.count("\n") == 1
+    assert "unexpected ZeroDivisionError at test_cli.py:" in err and "SLF_TRACEBACK=1" in err
+    monkeypatch.setenv("SLF_TRACEBACK", "1")
+    assert "Traceback" in leave(lambda: 1 // 0, capsys)[1]
+
+
+COMMANDS = sorted(
+    os.path.basename(path)
+    for path in glob.glob(os.path.join(SOURCE_DIR, "scripts", "*.py"))
+    if "cli.run(main)" in open(path).read()
+)
+
+
+@pytest.mark.parametrize("script", COMMANDS)
+def test_every_command_knows_its_version(script):
+    done = subprocess.run(
+        [sys.executable, os.path.join(SOURCE_DIR, "scripts", script), "--version"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        universal_newlines=True,
+    )
+    assert done.returncode == 0, done.stderr
+    with open(os.path.join(SOURCE_DIR, "package.xml")) as file:
+        wanted = re.search("<version>(.*)</version>", file.read()).group(1)
+    assert done.stdout == "%s %s\n" % (script, wanted)
+
+
+def small_program(body):
+    return [
+        sys.executable,
+        "-c",
+        "import sys; sys.path.insert(0, %r); sys.argv[0] = 'small'\n"
+        "from semantic_lidar_fusion import cli\n%s\ncli.run(main)\n"
+        % (os.path.join(SOURCE_DIR, "scripts"), body),
+    ]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_signals_end_it_as_control_c_does(number, tmp_path):
+    body = (
+        "import os, time\nfrom semantic_lidar_fusion.files import AtomicFile\n"
+        "def main():\n    file = AtomicFile(%r)\n    try:\n        print('ready', flush=True)\n"
+        "        time.sleep(60)\n    finally:\n        file.discard()" % str(tmp_path / "a")
+    )
+    process = subprocess.Popen(
+        small_program(body),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        universal_newlines=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(number)
+    err = process.communicate(timeout=30)[1]
+    assert process.returncode == 128 + number and err.count("\n") == 1, err
+    assert os.listdir(str(tmp_path)) == []
+
+
+def test_nohup_holds():
+    body = (
+        "import os, signal\ndef main():\n    os.kill(os.getpid(), signal.SIGHUP)\n    print('on')"
+    )
+    done = subprocess.run(
+        small_program(body),
+        stdout=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
+    )
+    assert (done.returncode, done.stdout) == (0, b"on\n")
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_do_not_become_files(tmp_path, closed):
+    body = (
+        "def main():\n    file = open(%r, 'w')\n    print('out')\n"
+        "    print('err', file=sys.stderr)\n    file.write('data')" % str(tmp_path / "a")
+    )
+    command = " ".join(map(shlex.quote, small_program(body))) + " " + closed
+    done = subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a").read_text() == "data"
+
+
+def test_a_full_stdout_is_one_line_and_an_early_reader_none():
+    body = "def main():\n    print('x' * 100000)"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(small_program(body), stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 1
+    assert done.stderr == b"small: error: stdout: No space left on device\n"
+    process = subprocess.Popen(small_program(body), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b"" and process.wait() == 141
+    process.stderr.close()
 
 
 def test_interrupt_and_success(capsys):

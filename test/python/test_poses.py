@@ -96,3 +96,47 @@ def test_loops_are_refused():
     tree.add(poses.to_message("b", "a", np.eye(4)), True)
     with pytest.raises(DataError, match="loop"):
         tree.lookup("c", "b", [1])
+
+
+def test_unusable_transforms_are_dropped_and_said(tmp_path, capfd):
+    pytest.importorskip("rosbag")
+    from tf2_msgs.msg import TFMessage
+
+    from semantic_lidar_fusion.bags.bag_io import BagReader, BagWriter
+
+    def moving(x, stamp_ns, parent="odom", child="base_link", **rotation):
+        made = poses.to_message(parent, child, np.eye(4), stamp_ns)
+        made.transform.translation.x = x
+        for axis, value in rotation.items():
+            setattr(made.transform.rotation, axis, value)
+        return made
+
+    path = str(tmp_path / "tf.bag")
+    with BagWriter(path, "none") as writer:
+        for number, transform in enumerate(
+            [
+                moving(0.0, 10),
+                moving(7.0, 11, w=0.0),
+                moving(7.0, 12, w=float("nan")),
+                moving(7.0, 13, w=2.0),
+                moving(float("inf"), 14),
+                moving(7.0, 0),
+                moving(7.0, 15, parent=""),
+                moving(7.0, 16, child="odom"),
+                moving(2.0, 20, w=1.005),
+            ]
+        ):
+            writer.write("/tf", TFMessage([transform]), number + 1)
+    with BagReader(path) as bag:
+        tree = poses.TransformTree.from_bag(bag)
+    assert sum(tree.dropped.values()) == 7
+    found, known = tree.lookup("odom", "base_link", np.array([10, 15, 20]))
+    assert known.all()
+    np.testing.assert_allclose(found[:, 0, 3], [0.0, 1.0, 2.0])
+    said = capfd.readouterr().err
+    for reason in ("norm 0; 1 is wanted", "norm 2", "not finite", "stamp is 0", "frames are empty"):
+        assert reason in said
+    assert path in said and "Traceback" not in said
+    for bad in ([0, 0, 0, 0], [0, 0, np.nan, 1]):
+        with pytest.raises(DataError):
+            poses.to_rotation(np.array(bad))

@@ -6,9 +6,6 @@ is well, so that a bag with the wanted name is always a whole one. Messages of v
 read and written whether or not that package is installed.
 """
 
-import contextlib
-import os
-import struct
 from types import TracebackType
 from typing import (
     Any,
@@ -21,10 +18,16 @@ from typing import (
     Sequence,
     Tuple,
     Type,
+    TypeVar,
 )
 
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.errors import DataError, cannot_write
+from semantic_lidar_fusion.files import AtomicFile, open_file, write_text
+
+__all__ = ["AtomicFile", "BagReader", "BagWriter", "write_text"]
+
+T = TypeVar("T")
 
 _RULE = "=" * 80 + "\n"
 _HEADER = """Header header
@@ -96,6 +99,11 @@ def message_class(type_name: str) -> Any:
     return _generated[type_name]
 
 
+def _told(error: Exception) -> str:
+    """An error's text, or its name where it has none."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
 def _text(value: Any) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
@@ -126,8 +134,11 @@ class RawMessage(NamedTuple):
 
     def message(self) -> Any:
         """Decoded by the definition that the bag brings along."""
-        message = self.content[-1]()
-        message.deserialize(self.content[1])
+        try:
+            message = self.content[-1]()
+            message.deserialize(self.content[1])
+        except Exception as error:  # whatever genpy meets in a damaged message
+            raise DataError("%s: a message is damaged (%s)" % (self.topic, _told(error))) from error
         return message
 
 
@@ -143,18 +154,19 @@ class BagReader:
         import rosbag
 
         self.path = path
+        self._file = open_file(path)
         try:
-            self._bag = rosbag.Bag(path, "r")
-        except OSError as error:
-            raise DataError("%s: %s" % (path, error.strerror or error)) from error
+            self._bag = rosbag.Bag(self._file, "r")
+            information = self._bag.get_type_and_topic_info()[1]
         except rosbag.ROSBagUnindexedException as error:
+            self._file.close()
             raise DataError(
                 "%s: the bag has no index (recording was cut off); repair it with "
                 "`rosbag reindex`" % path
             ) from error
-        except (rosbag.ROSBagException, struct.error, ValueError, KeyError) as error:
-            raise DataError("%s: not a readable bag (%s)" % (path, error)) from error
-        information = self._bag.get_type_and_topic_info()[1]
+        except Exception as error:  # whatever rosbag meets in a damaged file
+            self._file.close()
+            raise DataError("%s: not a readable bag (%s)" % (path, _told(error))) from error
         self.topics: Dict[str, str] = {}
         self._counts: Dict[str, int] = {}
         self._recorded_names: Dict[str, List[str]] = {}
@@ -177,6 +189,20 @@ class BagReader:
 
     def close(self) -> None:
         self._bag.close()
+        self._file.close()
+
+    def _guarded(self, entries: Iterable[T]) -> Iterator[T]:
+        """Passes the entries on; whatever rosbag, genpy or a message definition of a damaged bag
+        raises becomes a DataError. What the reader of the entries raises is its own."""
+        iterator = iter(entries)
+        while True:
+            try:
+                entry = next(iterator)
+            except StopIteration:
+                return
+            except Exception as error:
+                raise DataError("%s: damaged (%s)" % (self.path, _told(error))) from error
+            yield entry
 
     def topics_of_type(self, type_name: str) -> List[str]:
         """Names of the topics of a message type, sorted."""
@@ -219,8 +245,6 @@ class BagReader:
         names = [name for name in names if name in self.topics]
         if not names:
             return
-        import rosbag
-
         entries: Iterable[Any] = self._bag.read_messages(
             topics=[recorded for name in names for recorded in self._recorded_names[name]],
             start_time=None if start_ns is None else to_stamp(start_ns),
@@ -228,63 +252,17 @@ class BagReader:
         )
         if label is not None:
             entries = cli.progress(entries, self.count(names), label)
-        try:
-            for topic, message, stamp in entries:
-                yield BagMessage(_absolute(topic), message, to_ns(stamp))
-        except (rosbag.ROSBagException, struct.error, OSError, EOFError) as error:
-            raise DataError("%s: damaged (%s)" % (self.path, error)) from error
+        for topic, message, stamp in self._guarded(entries):
+            yield BagMessage(_absolute(topic), message, to_ns(stamp))
 
     def read_raw(self, label: Optional[str] = None) -> Iterator[RawMessage]:
         """All messages in order of record time, not decoded; `label` as in read()."""
-        import rosbag
-
         entries: Iterable[Any] = self._bag.read_messages(raw=True, return_connection_header=True)
         if label is not None:
             entries = cli.progress(entries, self.count(), label)
-        try:
-            for entry in entries:
-                header = {key: _text(value) for key, value in entry.connection_header.items()}
-                yield RawMessage(
-                    _absolute(entry.topic), entry.message, to_ns(entry.timestamp), header
-                )
-        except (rosbag.ROSBagException, struct.error, OSError, EOFError) as error:
-            raise DataError("%s: damaged (%s)" % (self.path, error)) from error
-
-
-class AtomicFile:
-    """A path beside `path` that becomes `path` when committed, and vanishes otherwise."""
-
-    def __init__(self, path: str):
-        folder = os.path.dirname(os.path.abspath(path))
-        if not os.path.isdir(folder):
-            raise DataError("%s: the folder %s does not exist" % (path, folder))
-        if os.path.isdir(path):
-            raise DataError("%s: is a folder" % path)
-        self.path = path
-        self.temporary = os.path.join(
-            folder, ".%s.%d.partial" % (os.path.basename(path), os.getpid())
-        )
-
-    @contextlib.contextmanager
-    def opening(self) -> Iterator[None]:
-        """For a writer's constructor: if the block fails or is interrupted, no context has been
-        entered yet that would clean up. DataError if the file cannot be written."""
-        try:
-            yield
-        except BaseException as error:
-            self.discard()
-            if isinstance(error, OSError):
-                raise cannot_write(self.path, error) from error
-            raise
-
-    def commit(self) -> None:
-        os.replace(self.temporary, self.path)
-
-    def discard(self) -> None:
-        try:
-            os.remove(self.temporary)
-        except FileNotFoundError:
-            pass
+        for entry in self._guarded(entries):
+            header = {key: _text(value) for key, value in entry.connection_header.items()}
+            yield RawMessage(_absolute(entry.topic), entry.message, to_ns(entry.timestamp), header)
 
 
 class BagWriter:
@@ -356,16 +334,3 @@ class BagWriter:
                 raise cannot_write(self.path, close_error) from close_error
         finally:
             self._file.discard()
-
-
-def write_text(path: str, text: str) -> None:
-    """Writes a text file whole or not at all; DataError if it cannot be written."""
-    file = AtomicFile(path)
-    try:
-        with open(file.temporary, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        file.commit()
-    except OSError as error:
-        raise cannot_write(path, error) from error
-    finally:
-        file.discard()

@@ -8,8 +8,12 @@ coordinates keeps its millimetres.
 from typing import Any, Dict, List, Optional, Set, Tuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
+from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.errors import DataError
+
+_TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 
 
 def make_transform(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -36,34 +40,23 @@ def transform_points(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(4,) unit quaternion, w >= 0, of the rotation (3, 3); the nearest one to a matrix that is
-    rounded (as calibration files are)."""
-    m = np.asarray(rotation, dtype=float)
-    # It is the eigenvector of the largest eigenvalue of this symmetric matrix (Bar-Itzhack 2000);
-    # eigh reads the lower half.
-    k = np.array(
-        [
-            [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
-            [m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
-            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1], 0],
-            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m.trace()],
-        ]
-    )
-    vectors = np.linalg.eigh(k)[1]
-    quaternion = vectors[:, -1]
+    """(4,) unit quaternion, w >= 0, of the rotation (3, 3); a near one to a matrix that is rounded
+    (as calibration files are)."""
+    quaternion: np.ndarray = Rotation.from_matrix(rotation).as_quat()
     return quaternion if quaternion[3] >= 0 else -quaternion
 
 
 def to_rotation(quaternion: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) rotations of quaternions (..., 4), which need not be normalised."""
+    """(..., 3, 3) rotations of quaternions (..., 4), which need not be normalised. DataError for
+    one that is zero or not finite."""
     q = np.asarray(quaternion, dtype=float)
-    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    flat = q.reshape(-1, 4)
+    if not np.isfinite(flat).all() or not flat.any(axis=1).all():
+        raise DataError("a quaternion is zero or not finite")
+    if not len(flat):
+        return np.zeros(q.shape[:-1] + (3, 3))
+    rotations: np.ndarray = Rotation.from_quat(flat).as_matrix()
+    return rotations.reshape(q.shape[:-1] + (3, 3))
 
 
 class PoseSeries:
@@ -99,61 +92,90 @@ class PoseSeries:
         result[covered] = np.eye(4)
         start, end = self.positions[before], self.positions[after]
         result[covered, :3, 3] = start + ratio[:, None] * (end - start)
-        quaternions = _slerp(self.quaternions[before], self.quaternions[after], ratio)
-        result[covered, :3, :3] = to_rotation(quaternions)
+        result[covered, :3, :3] = self._rotations(t)
         return result, covered
 
+    def _rotations(self, times_ns: np.ndarray) -> np.ndarray:
+        """(K, 3, 3) at times (K,) that the readings cover."""
+        if len(self) == 1 or not len(times_ns):
+            return to_rotation(np.repeat(self.quaternions[:1], len(times_ns), axis=0))
+        # A double holds 104 days in ns; counted from the first reading, times keep all digits.
+        elapsed = (self.stamps_ns - self.stamps_ns[0]).astype(float)
+        slerp = Slerp(elapsed, Rotation.from_quat(self.quaternions))
+        rotations: np.ndarray = slerp((times_ns - self.stamps_ns[0]).astype(float)).as_matrix()
+        return rotations
 
-def _slerp(a: np.ndarray, b: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    dot = np.sum(a * b, axis=-1)
-    b = np.where(dot[:, None] < 0, -b, b)
-    angle = np.arccos(np.clip(np.abs(dot), 0.0, 1.0))
-    small = angle < 1e-9
-    sine = np.where(small, 1.0, np.sin(angle))
-    weight_a = np.where(small, 1.0 - ratio, np.sin((1.0 - ratio) * angle) / sine)
-    weight_b = np.where(small, ratio, np.sin(ratio * angle) / sine)
-    return weight_a[:, None] * a + weight_b[:, None] * b
+
+# As fuse_bag takes them (checkedTransform in nodelets/edge/conversions.cpp).
+_NORM_TOLERANCE = 1e-2
 
 
 def from_message(transform: Any) -> np.ndarray:
-    """T (4, 4) of a geometry_msgs/Transform."""
+    """T (4, 4) of a geometry_msgs/Transform. DataError, with the reason, where a number is not finite
+    or the quaternion's norm is not 1."""
     r, t = transform.rotation, transform.translation
-    return make_transform(to_rotation(np.array([r.x, r.y, r.z, r.w])), np.array([t.x, t.y, t.z]))
+    quaternion, translation = np.array([r.x, r.y, r.z, r.w]), np.array([t.x, t.y, t.z])
+    if not np.isfinite(quaternion).all() or not np.isfinite(translation).all():
+        raise DataError("a number is not finite")
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1.0) > _NORM_TOLERANCE:
+        raise DataError("a quaternion of norm %.6g; 1 is wanted" % norm)
+    return make_transform(to_rotation(quaternion), translation)
 
 
 class TransformTree:
-    """The tf of a bag: static and moving edges, looked up along the tree."""
+    """The tf of a bag: static and moving edges, looked up along the tree.
+
+    dropped: reason -> number of transforms that could not be used."""
 
     def __init__(self) -> None:
         self._parents: Dict[str, str] = {}
         self._static: Dict[str, np.ndarray] = {}
         self._readings: Dict[str, Tuple[List[int], List[np.ndarray]]] = {}
         self._series: Dict[str, PoseSeries] = {}
+        self.dropped: Dict[str, int] = {}
 
     @staticmethod
     def from_bag(reader: Any) -> "TransformTree":
-        """Reads /tf_static, then /tf, of a bag_io.BagReader."""
+        """Reads /tf_static, then /tf, of a bag_io.BagReader. Warns of what it drops."""
         tree = TransformTree()
         for topic in ("/tf_static", "/tf"):
-            for entry in reader.read([topic]):
+            for entry in reader.read([topic], _TF_TYPES):
                 for transform in entry.message.transforms:
                     tree.add(transform, topic == "/tf_static")
+        for reason, count in sorted(tree.dropped.items()):
+            cli.warn("%s: %d transforms are dropped: %s" % (reader.path, count, reason))
         return tree
 
+    def __len__(self) -> int:
+        """Number of edges."""
+        return len(self._parents)
+
     def add(self, stamped: Any, static: bool) -> None:
-        """Adds a geometry_msgs/TransformStamped; a frame that was ever static stays so."""
+        """Adds a geometry_msgs/TransformStamped; a frame that was ever static stays so. One that
+        cannot be used is dropped and counted, by the rule of fuse_bag."""
         from semantic_lidar_fusion.bags.bag_io import to_ns
 
-        child = stamped.child_frame_id.lstrip("/")
+        child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
+        stamp_ns = to_ns(stamped.header.stamp)
+        try:
+            if not child or not parent or child == parent:
+                raise DataError("its frames are empty or the same")
+            if not static and stamp_ns == 0:
+                raise DataError("its stamp is 0")
+            pose = from_message(stamped.transform)
+        except DataError as error:
+            self.dropped[str(error)] = self.dropped.get(str(error), 0) + 1
+            return
         if not static and child in self._static:
             return
-        self._parents[child] = stamped.header.frame_id.lstrip("/")
+        self._parents[child] = parent
         if static:
-            self._static[child] = from_message(stamped.transform)
+            self._static[child] = pose
         else:
             stamps, poses = self._readings.setdefault(child, ([], []))
-            stamps.append(to_ns(stamped.header.stamp))
-            poses.append(from_message(stamped.transform))
+            stamps.append(stamp_ns)
+            poses.append(pose)
             self._series.pop(child, None)
 
     def _chain(self, frame: str) -> List[str]:

@@ -26,7 +26,7 @@ import calendar
 import os
 import re
 import time
-from typing import Callable, Dict, List, Optional, Tuple
+from typing import Callable, Dict, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
@@ -67,34 +67,58 @@ def parse_time(text: str, where: str) -> int:
     return seconds * 1000000000 + int((match.group(2) or "0").ljust(9, "0"))
 
 
-def _read_times(path: str) -> List[int]:
+def _read_times(path: str) -> Dict[int, int]:
+    """Number -> time of a timestamps.txt (line 1 = number 0). A frame that was lost has an empty
+    line or none."""
     lines = records.read_lines(records.require_file(path))
-    times = [parse_time(line, "%s line %d" % (path, i)) for i, line in enumerate(lines, 1)]
+    times = {
+        number: parse_time(line, "%s line %d" % (path, number + 1))
+        for number, line in enumerate(lines)
+        if line.strip()
+    }
     if not times:
         raise DataError("%s: empty" % path)
-    records.check_increasing(times, path)
     return times
 
 
-def _stamped_files(
-    folder: str, endings: List[str], stamps: str = "timestamps.txt"
-) -> Tuple[Dict[int, str], List[int]]:
-    """Files of folder/data by number, and the times of timestamps.txt (line 1 = number 0)."""
-    files = records.numbered_files(os.path.join(folder, "data"), endings)
-    times = _read_times(os.path.join(folder, stamps))
-    if len(files) != len(times) or max(files) >= len(times):
-        gaps = [n for n in range(len(times)) if n not in files]
-        raise DataError(
-            "%s: %d files in data, %d lines in %s%s"
-            % (
-                folder,
-                len(files),
-                len(times),
-                stamps,
-                " (no file number %d)" % gaps[0] if gaps else "",
-            )
-        )
-    return files, times
+class _Frames(NamedTuple):
+    """Frames of a sensor by number: file and time (ns), and what those that are left out lack."""
+
+    files: Dict[int, str]
+    times: Dict[int, int]
+    gaps: Dict[int, str]
+
+    def within(self, first: int, last: Optional[int]) -> Dict[int, str]:
+        """The gaps from `first` to `last`."""
+        return {
+            n: why for n, why in self.gaps.items() if n >= first and (last is None or n <= last)
+        }
+
+
+def _frames(folder: str, endings: List[str]) -> _Frames:
+    """The frames of folder/data that are whole: recordings have gaps, and downloads are cut short.
+
+    Left out are frames without a file, with an empty one, without a time, and those whose time is
+    not after the one before."""
+    found = records.numbered_files(os.path.join(folder, "data"), endings)
+    times = _read_times(os.path.join(folder, "timestamps.txt"))
+    gaps: Dict[int, str] = {}
+    whole = []
+    for number in sorted(set(found) | set(times)):
+        if number not in found:
+            gaps[number] = "no file"
+        elif number not in times:
+            gaps[number] = "no time in timestamps.txt"
+        elif not os.path.getsize(found[number]) and os.path.isfile(found[number]):
+            gaps[number] = "its file is empty"
+        else:
+            whole.append(number)
+    kept = [whole[i] for i in records.rising([times[n] for n in whole])]
+    for number in set(whole) - set(kept):
+        gaps[number] = "its time is not after the one before it"
+    if not kept:
+        raise DataError("%s: no frame has both a file and a time" % folder)
+    return _Frames({n: found[n] for n in kept}, {n: times[n] for n in kept}, gaps)
 
 
 def mercator_poses(readings: np.ndarray) -> np.ndarray:
@@ -126,17 +150,19 @@ def mercator_poses(readings: np.ndarray) -> np.ndarray:
 
 
 def _read_oxts(folder: str) -> Tuple[np.ndarray, np.ndarray]:
-    files, times = _stamped_files(folder, [".txt"])
+    frames = _frames(folder, [".txt"])
+    records.say_gaps(folder, frames.gaps)
     rows = []
-    for number in sorted(files):
-        lines = records.read_lines(files[number])
+    for number, file in sorted(frames.files.items()):
+        lines = records.read_lines(file)
         if not lines:
-            raise DataError("%s: empty" % files[number])
-        rows.append(records.parse_numbers(lines[0], 30, files[number]))
+            raise DataError("%s: empty" % file)
+        rows.append(records.parse_numbers(lines[0], 30, file))
     readings = np.array(rows)
     if (np.abs(readings[:, 0]) > 89).any() or (np.abs(readings[:, 1]) > 360).any():
         raise DataError("%s: a latitude or longitude is out of range" % folder)
-    return np.array(times, dtype=np.int64), mercator_poses(readings)
+    stamps = [frames.times[number] for number in sorted(frames.files)]
+    return np.array(stamps, dtype=np.int64), mercator_poses(readings)
 
 
 def _read_rigid(path: str) -> np.ndarray:
@@ -146,12 +172,11 @@ def _read_rigid(path: str) -> np.ndarray:
 
 
 def _read_camera(
-    folder: str, name: str, calibration: str, t_velo_cam0: np.ndarray, rectified: bool
+    frames: _Frames, name: str, calibration: str, t_velo_cam0: np.ndarray, rectified: bool
 ) -> records.CameraRecord:
     """One camera; `t_velo_cam0` places the unrectified reference camera in the lidar's frame."""
     number = name[-2:]
-    files, times = _stamped_files(os.path.join(folder, name), [".png", ".jpg"])
-    images = [records.ImageRecord(times[n], files[n]) for n in sorted(files)]
+    images = [records.ImageRecord(frames.times[n], f) for n, f in sorted(frames.files.items())]
     if rectified:
         entry = records.read_calibration(calibration, {"P_rect_" + number: 12, "R_rect_00": 9})
         r_rect = records.check_rotation(
@@ -189,37 +214,60 @@ def _scan_loader(
     return load
 
 
-def _read_scans(folder: str) -> List[records.ScanRecord]:
-    files, forward = _stamped_files(folder, [".bin", ".txt"])
+def _read_scans(folder: str, first: int, last: Optional[int]) -> List[records.ScanRecord]:
+    """The scans from number `first` to `last` whose sweep is known."""
+    frames = _frames(folder, [".bin", ".txt"])
     start = _read_times(os.path.join(folder, "timestamps_start.txt"))
     end = _read_times(os.path.join(folder, "timestamps_end.txt"))
-    if not len(start) == len(end) == len(forward):
-        raise DataError(
-            "%s: %d, %d and %d lines in timestamps_start, timestamps and timestamps_end.txt"
-            % (folder, len(start), len(forward), len(end))
-        )
+    gaps = frames.within(first, last)
     result = []
     odd = 0
-    for n in sorted(files):
-        if end[n] <= start[n]:
-            raise DataError(
-                "%s: line %d of timestamps_end.txt is not after the start" % (folder, n + 1)
-            )
-        if end[n] - start[n] > 10**9:
-            raise DataError("%s: the sweep of line %d takes more than a second" % (folder, n + 1))
-        middle = forward[n]
+    for n in records.pick(frames.files, first, last, folder):
+        if n not in start or n not in end:
+            gaps[n] = "no start or end of its sweep"
+            continue
+        if not 0 < end[n] - start[n] <= 10**9:
+            gaps[n] = "its sweep takes %.3f s" % ((end[n] - start[n]) * 1e-9)
+            continue
+        middle = frames.times[n]
         if not start[n] < middle < end[n]:
             odd += 1
             middle = (start[n] + end[n]) // 2
-        result.append(
-            records.ScanRecord(start[n], _scan_loader(files[n], start[n], middle, end[n]))
-        )
+        load = _scan_loader(frames.files[n], start[n], middle, end[n])
+        result.append(records.ScanRecord(start[n], load))
+    kept = records.rising([scan.stamp_ns for scan in result])
+    if len(kept) < len(result):
+        warn("%s: %d scans start before the one before" % (folder, len(result) - len(kept)))
+    records.say_gaps(folder, gaps)
     if odd:
         warn(
             "%s: %d lines of timestamps.txt lie outside their sweep; the middle of the sweep is used"
             % (folder, odd)
         )
-    return result
+    if not kept:
+        raise DataError("%s: the sweep of no scan is known" % folder)
+    return [result[i] for i in kept]
+
+
+def _camera_frames(
+    folder: str, cameras: List[str], first: int, last: Optional[int], same_numbers: bool
+) -> Dict[str, _Frames]:
+    """Image frames of each camera that has any. `same_numbers`: as those of the scans."""
+    found: Dict[str, _Frames] = {}
+    problems = []
+    for camera in cameras:
+        try:
+            found[camera] = _frames(os.path.join(folder, camera), [".png", ".jpg"])
+        except DataError as error:
+            problems.append(str(error))
+            continue
+        gaps = found[camera].within(first, last) if same_numbers else found[camera].gaps
+        records.say_gaps(os.path.join(folder, camera), gaps)
+    if not found:
+        raise DataError("; ".join(problems))
+    for problem in problems:
+        warn("a camera is left out: %s" % problem)
+    return found
 
 
 def _read_raw(
@@ -242,13 +290,14 @@ def _read_raw(
     t_velo_imu = _read_rigid(os.path.join(calibration, "calib_imu_to_velo.txt"))
     t_cam0_velo = _read_rigid(os.path.join(calibration, "calib_velo_to_cam.txt"))
     cam_to_cam = os.path.join(calibration, "calib_cam_to_cam.txt")
+    frames = _camera_frames(folder, cameras, first, last, not unrectified)
     read_cameras = [
-        _read_camera(folder, c, cam_to_cam, poses.invert(t_cam0_velo), not unrectified)
+        _read_camera(frames[c], c, cam_to_cam, poses.invert(t_cam0_velo), not unrectified)
         for c in cameras
+        if c in frames
     ]
     odometry = _read_oxts(os.path.join(folder, "oxts"))
-    scans = _read_scans(os.path.join(folder, "velodyne_points"))
-    scans = [scans[n] for n in records.pick(range(len(scans)), first, last, folder)]
+    scans = _read_scans(os.path.join(folder, "velodyne_points"), first, last)
     return records.Drive(
         name,
         labels,

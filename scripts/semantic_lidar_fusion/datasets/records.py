@@ -6,13 +6,16 @@ images and scans are read only when they are written. Also here: what the reader
 checking files, image headers, rings and times of spinning lidars).
 """
 
+import bisect
 import os
 import re
 from typing import Any, Callable, Dict, Iterable, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
+from semantic_lidar_fusion.cli import warn
 from semantic_lidar_fusion.errors import DataError
+from semantic_lidar_fusion.files import open_file
 from semantic_lidar_fusion.labels import NO_LABEL, LabelSet
 
 # Data sets that count time from zero start here: a ROS stamp must not be 0.
@@ -110,7 +113,7 @@ def numbered_files(folder: str, endings: Sequence[str]) -> Dict[int, str]:
 
 def read_bytes(path: str) -> bytes:
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             return file.read()
     except OSError as error:
         raise DataError("%s: %s" % (path, error.strerror or error)) from error
@@ -328,6 +331,35 @@ def check_increasing(stamps_ns: Sequence[int], where: str) -> None:
     for index, (a, b) in enumerate(zip(stamps_ns, stamps_ns[1:])):
         if b <= a:
             raise DataError("%s: time %d is not after the one before it" % (where, index + 2))
+
+
+def rising(stamps_ns: Sequence[int]) -> List[int]:
+    """Positions of the longest part of a series in which each time is after the one before it: a
+    clock that repeats itself or steps back costs its own readings, and no other's."""
+    ends: List[int] = []  # position of the least last time of a part of each length
+    times: List[int] = []
+    before = [-1] * len(stamps_ns)
+    for position, stamp in enumerate(stamps_ns):
+        length = bisect.bisect_left(times, stamp)
+        before[position] = ends[length - 1] if length else -1
+        ends[length:], times[length:] = (
+            [position] + ends[length + 1 :],
+            [stamp] + times[length + 1 :],
+        )
+    chosen = [ends[-1]] if ends else []
+    while chosen and before[chosen[-1]] >= 0:
+        chosen.append(before[chosen[-1]])
+    return chosen[::-1]
+
+
+def say_gaps(where: str, gaps: Dict[int, str]) -> None:
+    """Warns of frames that are left out: number -> what it lacks."""
+    if gaps:
+        first = min(gaps)
+        warn(
+            "%s: %d frames are left out (the first is number %d: %s)"
+            % (where, len(gaps), first, gaps[first])
+        )
 
 
 def pick(numbers: Iterable[int], first: int, last: Optional[int], where: str) -> List[int]:
