@@ -1,7 +1,8 @@
 #!/usr/bin/python3
 # SPDX-License-Identifier: MIT
 """Scores semantic clouds against truth: the paper's Table I for direct projection, with motion
-correction, and with motion correction and occlusion mask."""
+correction, with motion correction and occlusion mask (all with the paper's settings), and for the
+rig as it is; and F1* over the points that a camera truly sees."""
 
 import argparse
 import os
@@ -15,6 +16,7 @@ EPILOG = """\
 The truth is the topic /points_truth (PointCloud2: x y z, label u8 = class id; the same points in the
 same order as the scan); simulate_drive and import_dataset.py write it. Written to --out: report.md,
 table1.csv, summary.csv, confusion_*.csv, visibility.csv, temperatures.csv, masks.csv, and PNG plots.
+docs/results.md explains every table.
 
   evaluate.py drive.bag --rig rig.yaml --out results
   evaluate.py seed1.bag seed2.bag seed3.bag --rig rig.yaml --out results
@@ -64,6 +66,18 @@ def make_parser():
         default=[],
         dest="settings",
         help="override a key of the rig file in all runs; repeatable",
+    )
+    parser.add_argument(
+        "--paper",
+        action="store_true",
+        help="only the paper's settings, whatever the rig says: without the last column, which is "
+        "the rig as it is",
+    )
+    parser.add_argument(
+        "--bounds",
+        action="store_true",
+        help="also the rig with true visibility, with true odometry and with both, from the truth "
+        "of simulate_drive",
     )
     parser.add_argument(
         "--min-edge-px",
@@ -143,15 +157,19 @@ def check(parser, options):
         for name in ("model", "classes"):
             if not getattr(options, name):
                 parser.error("--images needs --" + name)
-        for name in ("rig", "truth", "clouds", "fit_on", "live", "masks", "map"):
+        for name in ("rig", "truth", "clouds", "fit_on", "live", "masks", "map", "paper", "bounds"):
             if getattr(options, name):
                 parser.error("--images and --%s exclude each other" % name.replace("_", "-"))
     elif not options.rig and not options.clouds:
         parser.error("give --rig, or --clouds of existing bags")
     if options.masks and not options.rig:
         parser.error("--masks needs --rig")
-    for name in ("truth", "clouds", "live", "fit_temperature", "map"):
-        if getattr(options, name) and len(options.bags) > 1:
+    for name in ("paper", "bounds"):
+        if getattr(options, name) and options.clouds:
+            parser.error("--%s runs fuse_bag; it has no use for --clouds" % name)
+    for name in ("truth", "clouds", "live", "fit_temperature", "map", "paper", "bounds"):
+        single = name not in ("paper", "bounds")
+        if single and getattr(options, name) and len(options.bags) > 1:
             parser.error("--%s is for one IN.bag" % name.replace("_", "-"))
         if getattr(options, name) and options.masks and name != "truth":
             parser.error("--masks and --%s exclude each other" % name.replace("_", "-"))
@@ -171,10 +189,14 @@ def main():
     parser = make_parser()
     options = parser.parse_args()
     check(parser, options)
-    cli.require("numpy", "yaml", "rosbag", "matplotlib")
+    cli.require("numpy", "scipy", "yaml", "rosbag", "matplotlib")
     from semantic_lidar_fusion.evaluation import run
 
-    print(run.evaluate(options))
+    values = dict(vars(options))
+    for name in ("bags", "settings"):
+        values[name] = tuple(values[name])
+    values["clouds"] = tuple(tuple(text.split("=", 1)) for text in options.clouds)
+    print(run.evaluate(run.Options(**values)))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,9 @@ def make_parser():
         "--source IN.bag --rig FILE --out figures",
     )
     parser.add_argument("bag", metavar="FUSED.bag", help="written by fuse_bag --all")
-    parser.add_argument("--rig", metavar="FILE", required=True, help="the rig file")
+    parser.add_argument(
+        "--rig", metavar="FILE", help="the rig file (default: the rig that FUSED.bag tells)"
+    )
     parser.add_argument(
         "--source", metavar="IN.bag", help="the bag that was fused: images, camera_info and tf"
     )
@@ -52,16 +54,16 @@ def _figures(text):
 
 def main():
     options = make_parser().parse_args()
-    cli.require("numpy", "yaml", "rosbag", "matplotlib", "cv2")
+    cli.require("numpy", "scipy", "yaml", "rosbag", "matplotlib", "cv2")
     from semantic_lidar_fusion.figures import paper_figures
     from semantic_lidar_fusion.errors import DataError
-    from semantic_lidar_fusion.evaluation.scoring import Rig
+    from semantic_lidar_fusion.rig import Rig
 
     if not options.force and os.path.isdir(options.out):
         old = [name for name in os.listdir(options.out) if name.startswith("figure")]
         if old:
             raise DataError("%s: holds %s; --force replaces them" % (options.out, min(old)))
-    rig = Rig(options.rig)
+    rig = Rig.load(options.rig) if options.rig else None
     scene = paper_figures.load_scene(options.bag, options.source, rig, options.scan)
     for path in paper_figures.make(scene, options.out, options.figures, options.camera):
         print(path)

@@ -9,7 +9,7 @@ import pytest
 bag_factory = pytest.importorskip("bag_factory")
 cv2 = pytest.importorskip("cv2")
 from bag_factory import CLASS_NAMES, Drive  # noqa: E402
-from semantic_lidar_fusion.evaluation import scoring  # noqa: E402
+from semantic_lidar_fusion.rig import Rig  # noqa: E402
 from semantic_lidar_fusion.figures import paper_figures  # noqa: E402
 from semantic_lidar_fusion.cameras import Camera  # noqa: E402
 from semantic_lidar_fusion.bags.cloud_io import FUSED, OCCLUDED  # noqa: E402
@@ -129,7 +129,7 @@ def fused(tmp_path_factory):
 
 
 def test_projection_agrees_with_the_fused_cloud(fused):
-    scene = paper_figures.load_scene(fused[0], fused[1], scoring.Rig(fused[2]))
+    scene = paper_figures.load_scene(fused[0], fused[1], Rig.load(fused[2]))
     cloud = scene.cloud
     assert len(scene.views) == len(Drive().cameras)
     for view in scene.views:
@@ -151,7 +151,7 @@ def test_projection_agrees_with_the_fused_cloud(fused):
 
 
 def test_panorama_shows_the_classes_around(fused):
-    scene = paper_figures.load_scene(fused[0], fused[1], scoring.Rig(fused[2]))
+    scene = paper_figures.load_scene(fused[0], fused[1], Rig.load(fused[2]))
     picture, seen, extent = paper_figures.panorama(scene, columns=600)
     assert picture.shape[:2] == seen.shape and 500 < picture.shape[1] < 720
     left, right, bottom, top = extent

@@ -10,6 +10,7 @@ import pytest
 rosbag = pytest.importorskip("rosbag")
 
 from conftest import SOURCE_DIR  # noqa: E402
+from semantic_lidar_fusion.rig import Rig  # noqa: E402
 from semantic_lidar_fusion.evaluation import scoring  # noqa: E402
 
 BIN_DIR = os.environ.get("SLF_BIN_DIR", "")
@@ -33,11 +34,11 @@ def test_nothing_is_wrong_where_nothing_is_uncertain(tmp_path):
     simulate = [PROGRAMS[0], "--out", bag, "--duration", "0.3", "--scale", "0.3", "--quiet"]
     run(*(simulate + ["--exact", "--static", "--speed", "15"]))
     run(PROGRAMS[1], bag, fused, "--rig", RIG, "--quiet")
-    rig = scoring.Rig(RIG)
+    rig = Rig.load(RIG)
     truth = scoring.Truth(str(bag), len(rig.labels))
     clouds = scoring.FusedBag(str(fused), rig.labels.names)
     score = scoring.Score("exact", rig.labels, 1.5)
-    names = [camera["name"] for camera in rig.cameras]
+    names = [camera.name for camera in rig.cameras]
     checked, wrong = np.zeros(len(names), int), np.zeros(len(names), int)
     for _, cloud, scan in scoring.paired(truth, clouds):
         chosen = score.select(cloud, scan)
@@ -60,17 +61,17 @@ def test_each_step_helps_on_a_fast_drive(tmp_path):
     bag = tmp_path / "drive.bag"
     simulate = [PROGRAMS[0], "--out", bag, "--duration", "0.3", "--scale", "0.3", "--quiet"]
     run(*(simulate + ["--perfect-network", "--static", "--speed", "15"]))
-    rig = scoring.Rig(RIG)
+    rig = Rig.load(RIG)
     truth = scoring.Truth(str(bag), len(rig.labels))
     scores = []
-    for configuration in rig.configurations():
+    for configuration in scoring.configurations(rig):
         fused = str(tmp_path / (configuration.name + ".bag"))
         scoring.run_fuse_bag(PROGRAMS[1], str(bag), fused, RIG, configuration.settings)
         clouds = scoring.FusedBag(fused, rig.labels.names)
         scores.append(scoring.score_bag(configuration.name, clouds, truth, rig.labels))
     accuracy = [score.confusion.accuracy for score in scores]
-    assert accuracy[0] < accuracy[1] < accuracy[2]
-    first, last = scores[0].confusion, scores[2].confusion
+    assert accuracy[0] < accuracy[1] < accuracy[-1]
+    first, last = scores[0].confusion, scores[-1].confusion
     present = last.support > 100
     assert present.sum() >= 6
     assert (last.f1[present] > first.f1[present]).all()

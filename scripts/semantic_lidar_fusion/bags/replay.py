@@ -14,14 +14,13 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticArray
 
 from semantic_lidar_fusion.errors import DataError
-from semantic_lidar_fusion.evaluation.scoring import Rig
+from semantic_lidar_fusion.evaluation.scoring import PACKAGE
+from semantic_lidar_fusion.rig import Rig
 
 # A nodelet takes a clock that stands still for longer as the end of a bag (fusion_nodelet.cpp), s.
 CLOCK_STALL_S = 3.0
 # Nodelets report once a second; twice that, and a second for a machine that is busy.
 REPORT_LAG_S = 3.0
-# A timeout of the rig file that it does not name, s: the longest default.
-DEFAULT_TIMEOUT_S = 0.2
 
 
 class Reports:
@@ -78,13 +77,8 @@ def _wait(condition: Callable[[], Any], timeout_s: Optional[float] = None) -> bo
 
 def _longest_wait_s(rig: Rig) -> float:
     """The time after the last message of a bag in which its last scan may still come out."""
-    timeouts = [float(c.get("timeout", DEFAULT_TIMEOUT_S)) for c in rig.cameras]
-    timeouts += [
-        float(rig.value("cameras." + str(c["name"]), "timeout", DEFAULT_TIMEOUT_S))
-        for c in rig.cameras
-    ]
-    for section in ("reference", "odometry"):
-        timeouts.append(float(rig.value(section, "timeout", DEFAULT_TIMEOUT_S)))
+    timeouts = [camera.timeout_s for camera in rig.cameras]
+    timeouts += [rig.number("reference.timeout"), rig.number("odometry.timeout")]
     return CLOCK_STALL_S + 3 * max(timeouts) + REPORT_LAG_S
 
 
@@ -114,14 +108,13 @@ def _end_recorder(path: str) -> str:
     return path
 
 
-def _evaluate(options: Any, rig: Rig, recorded: str, settings: list) -> None:
+def _evaluate(options: Any, recorded: str, settings: list) -> None:
     command = [
         sys.executable,
         os.path.join(os.path.dirname(os.path.abspath(sys.argv[0])), "evaluate.py"),
         options.bag,
         "--rig=" + options.rig,
-        # The column has the name that it has offline, where it is one of three.
-        "--clouds=%s=%s" % (rig.configurations()[-1].name, recorded),
+        "--clouds=%s=%s" % (PACKAGE, recorded),
         "--out=" + options.evaluate,
         "--force",
     ]
@@ -133,7 +126,7 @@ def _evaluate(options: Any, rig: Rig, recorded: str, settings: list) -> None:
 def finish(options: Any) -> None:
     """Waits for the end, then does what the options of finish_replay.py ask for."""
     settings = options.overrides.split()
-    rig = Rig(options.rig, settings)
+    rig = Rig.load(options.rig, settings)
     rospy.init_node("finish_replay", disable_signals=False)
     reports = Reports()
     player, output = rospy.resolve_name("player"), rospy.resolve_name("points_semantic")
@@ -149,4 +142,4 @@ def finish(options: Any) -> None:
     if options.recorded:
         recorded = _end_recorder(options.recorded)
         if options.evaluate:
-            _evaluate(options, rig, recorded, settings)
+            _evaluate(options, recorded, settings)

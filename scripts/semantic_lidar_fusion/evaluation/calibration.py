@@ -10,6 +10,7 @@ import math
 from typing import List, NamedTuple, Tuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from semantic_lidar_fusion.errors import DataError
 from semantic_lidar_fusion.labels import NO_LABEL
@@ -17,7 +18,6 @@ from semantic_lidar_fusion.evaluation.metrics import MIN_PROBABILITY
 
 MIN_TEMPERATURE, MAX_TEMPERATURE = 0.05, 50.0
 MAX_SAMPLES = 60000
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
 class Variant(NamedTuple):
@@ -51,7 +51,8 @@ def log_loss(
 def fit_temperature(probabilities: np.ndarray, truth: np.ndarray, merge: np.ndarray) -> float:
     """The temperature of least NLL, from 0.05 to 50, to 0.1 %.
 
-    Arguments as for log_loss, all with a true row. A coarse search in ln T, then a golden section.
+    Arguments as for log_loss, all with a true row. Brent's method in ln T, bounded to the
+    neighbours of the best place of a coarse grid, for there may be several minima.
     """
     if not len(truth):
         raise DataError("no labelled points with truth to fit a temperature to")
@@ -61,19 +62,9 @@ def fit_temperature(probabilities: np.ndarray, truth: np.ndarray, merge: np.ndar
 
     grid = np.linspace(math.log(MIN_TEMPERATURE), math.log(MAX_TEMPERATURE), 25)
     best = int(np.argmin([loss(value) for value in grid]))
-    low, high = grid[max(0, best - 1)], grid[min(len(grid) - 1, best + 1)]
-    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    loss_left, loss_right = loss(left), loss(right)
-    while high - low > 1e-3:
-        if loss_left <= loss_right:
-            high, right, loss_right = right, left, loss_left
-            left = high - _GOLDEN * (high - low)
-            loss_left = loss(left)
-        else:
-            low, left, loss_left = left, right, loss_right
-            right = low + _GOLDEN * (high - low)
-            loss_right = loss(right)
-    return math.exp((low + high) / 2)
+    bounds = (grid[max(0, best - 1)], grid[min(len(grid) - 1, best + 1)])
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3})
+    return math.exp(found.x)
 
 
 class Samples:

@@ -6,7 +6,7 @@ labels.NO_LABEL marks what has none. All classes add up scan by scan, so that a 
 needs the memory of one scan. A quotient without a denominator is NaN.
 """
 
-from typing import List
+from typing import Any, List, Optional
 
 import numpy as np
 
@@ -81,6 +81,44 @@ class Confusion:
     @property
     def accuracy(self) -> float:
         return float(ratio(self.hits.sum(), self.total))
+
+
+class VisibleConfusion:
+    """Counts for F1*: the truth is every point that a camera really sees.
+
+    confusion: as Confusion, of the seen points; one without a label, or with that of a discarded
+    class, is a miss. intruders: (R,) int64, hidden points by the row that they were wrongly taken
+    for; a hidden point that has the right label counts for nothing. F1 of fused points alone rises
+    when a mask throws hard points away; F1* falls.
+    """
+
+    def __init__(self, rows: int):
+        self.confusion = Confusion(rows)
+        self.intruders = np.zeros(rows, dtype=np.int64)
+
+    def add(self, truth: np.ndarray, predicted: np.ndarray, seen: np.ndarray) -> None:
+        """truth, predicted: (N,) rows, NO_LABEL without one; seen: (N,) bool. Points without a true
+        row are left out."""
+        self.confusion.add(truth[seen], predicted[seen])
+        wrong = ~seen & (truth != NO_LABEL) & (predicted != NO_LABEL) & (predicted != truth)
+        self.intruders += np.bincount(predicted[wrong], minlength=len(self.intruders))
+
+    def merge(self, other: "VisibleConfusion") -> None:
+        self.confusion.merge(other.confusion)
+        self.intruders += other.intruders
+
+    @property
+    def f1(self) -> np.ndarray:
+        """(R,) 2 hits / (seen points of the row + points taken for it); NaN without seen points."""
+        taken = self.confusion.matrix[:, :-1].sum(axis=0) + self.intruders
+        both = self.confusion.support + taken
+        return np.where(self.confusion.support > 0, ratio(2 * self.confusion.hits, both), np.nan)
+
+
+def mean_over_rows(values: np.ndarray) -> float:
+    """The mean of the rows that have a value; NaN if none has."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else float("nan")
 
 
 class Reliability:
@@ -180,9 +218,9 @@ class Visibility:
         unmasked: np.ndarray,
         masked: np.ndarray,
         visible: np.ndarray,
-        catchable: np.ndarray = None,
-        silhouette: np.ndarray = None,
-        apart: np.ndarray = None,
+        catchable: Optional[np.ndarray] = None,
+        silhouette: Optional[np.ndarray] = None,
+        apart: Optional[np.ndarray] = None,
     ) -> None:
         """unmasked, masked: cameras that contributed without and with the mask; visible: cameras
         that really see the point; catchable: hidden from the camera by something that the lidar
@@ -209,7 +247,7 @@ class Visibility:
             self.beside += _bits(seen & silhouette)
             self.beside_lost += _bits(seen & silhouette & lost)
 
-    def rows(self) -> List[list]:
+    def rows(self) -> List[List[Any]]:
         """[what, points, share] for a table."""
         result = [
             ["hidden points caught", self.hidden, float(ratio(self.hidden_caught, self.hidden))]

@@ -1,26 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""From the options of evaluate.py to its files."""
+"""From what evaluate.py is asked to its files."""
 
 import os
 import shutil
 import tempfile
-from typing import Any, Dict, List, Optional, Sequence, Tuple
+from dataclasses import dataclass
+from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
-from semantic_lidar_fusion.evaluation import image_truth, scoring, tables
-from semantic_lidar_fusion.figures import plotting
-from semantic_lidar_fusion.bags.bag_io import write_text
-from semantic_lidar_fusion.evaluation.calibration import Variant
+from semantic_lidar_fusion.bags.bag_io import BagReader, write_text
 from semantic_lidar_fusion.errors import DataError
+from semantic_lidar_fusion.evaluation import image_truth, scoring, tables
+from semantic_lidar_fusion.evaluation.calibration import Variant
+from semantic_lidar_fusion.evaluation.metrics import Visibility
 from semantic_lidar_fusion.evaluation.scoring import (
+    PACKAGE,
     CalibrationCase,
     Configuration,
     FusedBag,
-    Rig,
     Score,
     Truth,
 )
+from semantic_lidar_fusion.figures import plotting
 from semantic_lidar_fusion.labels import LabelSet
-from semantic_lidar_fusion.evaluation.metrics import Visibility
+from semantic_lidar_fusion.rig import Rig, find_fuse_bag
 
 REPORT = "report.md"
 
@@ -31,22 +33,30 @@ class Results:
     def __init__(self) -> None:
         self.sections: List[str] = []
         self.files: Dict[str, str] = {}
-        self.plots: List[Tuple[str, Any, tuple]] = []
+        self.plots: List[Tuple[str, Callable[..., None], Tuple[Any, ...]]] = []
 
-    def add_scores(self, scores: Sequence[Score], rates: Optional[Visibility]) -> None:
+    def add_scores(self, scores: Sequence[Score], rates: Dict[str, Visibility]) -> None:
+        """rates: what the masks of the configurations catch and lose, by name."""
         self.sections += ["## Recall, precision and F1\n", tables.table_one(scores)]
+        visible = tables.f1_star(scores)
+        if visible:
+            self.sections += ["## F1 of fused points, and F1* of visible points\n", visible]
         self.sections += ["## Points\n", tables.summary(scores)]
         self.files["table1.csv"] = tables.table_one_csv(scores)
         self.files["summary.csv"] = tables.summary_csv(scores)
         for score in scores:
             self.files["confusion_%s.csv" % score.name] = tables.confusion_csv(score)
-        if rates is not None:
-            self.sections += ["## Occlusion mask\n", tables.visibility(rates)]
+        if rates:
+            self.sections += ["## Occlusion masks\n", tables.visibility(rates)]
             self.files["visibility.csv"] = tables.visibility_csv(rates)
         confusions = [(score.name, score.confusion) for score in scores]
         reliabilities = [(score.name, score.reliability) for score in scores]
         rows, shown = scores[0].rows, tables.present_rows(scores)
-        self.plots.append(("f1.png", plotting.draw_f1, (rows, shown, confusions)))
+        f1 = [(score.name, score.confusion.f1) for score in scores]
+        self.plots.append(("f1.png", plotting.draw_f1, (rows, shown, f1, "F1")))
+        if visible:
+            stars = [(score.name, score.f1_star) for score in scores]
+            self.plots.append(("f1_star.png", plotting.draw_f1, (rows, shown, stars, "F1*")))
         self.plots.append(("confusion.png", plotting.draw_confusions, (rows, shown, confusions)))
         self.plots.append(("reliability.png", plotting.draw_reliability, (reliabilities,)))
 
@@ -91,8 +101,76 @@ class Results:
         return report + "\nwritten to %s: %s" % (folder, ", ".join(names))
 
 
-def evaluate(options: Any) -> str:
-    """Does what the options of evaluate.py ask for; returns the text to print."""
+@dataclass(frozen=True)
+class Options:
+    """What to evaluate, and how; the fields are the options of evaluate.py.
+
+    clouds: (name, bag) of existing clouds. live: a bag recorded from the nodelets. truth: the bag
+    with points_truth (None: the drive itself)."""
+
+    out: str
+    bags: Tuple[str, ...] = ()
+    rig: Optional[str] = None
+    settings: Tuple[str, ...] = ()
+    clouds: Tuple[Tuple[str, str], ...] = ()
+    live: Optional[str] = None
+    truth: Optional[str] = None
+    paper: bool = False
+    bounds: bool = False
+    min_edge_px: float = 0.0
+    masks: bool = False
+    fit_temperature: bool = False
+    fit_on: Optional[str] = None
+    map: bool = False
+    voxel: float = 0.2
+    frame: Optional[str] = None
+    images: Optional[str] = None
+    model: Optional[str] = None
+    classes: Optional[str] = None
+    label_suffix: str = "_annot"
+    pixel_step: int = 2
+    fuse_bag: Optional[str] = None
+    keep_bags: bool = False
+    force: bool = False
+
+
+class Column(NamedTuple):
+    """A configuration that has run. unmasked: the same run without its mask, where that was made."""
+
+    name: str
+    path: str
+    unmasked: Optional[str] = None
+
+
+class Fuser:
+    """Runs fuse_bag with one rig, into a folder."""
+
+    def __init__(self, options: Options, rig: Rig, workspace: str):
+        self.rig, self._workspace = rig, workspace
+        self._program = find_fuse_bag(options.fuse_bag)
+        self._settings = list(options.settings) + scoring.required_settings(rig)
+
+    @property
+    def settings(self) -> List[str]:
+        """Overrides of all runs."""
+        return list(self._settings)
+
+    @property
+    def program(self) -> str:
+        return self._program
+
+    def fuse(self, bag: str, configuration: Configuration, prefix: str = "") -> str:
+        """The path of the fused bag."""
+        target = os.path.join(self._workspace, "%s%s.bag" % (prefix, configuration.name))
+        settings = self._settings + list(configuration.settings)
+        scoring.run_fuse_bag(
+            self._program, bag, target, self.rig.path, settings, truth=configuration.truth
+        )
+        return target
+
+
+def evaluate(options: Options) -> str:
+    """Evaluates into the folder `out`; returns the text to print."""
     folder = options.out
     if os.path.exists(os.path.join(folder, REPORT)) and not options.force:
         raise DataError("%s: holds the results of an earlier run; --force replaces them" % folder)
@@ -102,8 +180,10 @@ def evaluate(options: Any) -> str:
         results = Results()
         if options.images:
             title = _evaluate_images(options, results, workspace)
+        elif options.masks:
+            title = _evaluate_masks(options, results, workspace)
         else:
-            title = _evaluate_drive(options, results, workspace)
+            title = _evaluate_drives(options, results, workspace)
         text = results.write(folder, title)
         if options.keep_bags:
             for name in sorted(os.listdir(workspace)):
@@ -114,76 +194,96 @@ def evaluate(options: Any) -> str:
 
 
 def _truth(rig: Optional[Rig], path: str, labels: LabelSet) -> Truth:
-    offset_s = float(rig.value("lidar", "time_offset", 0.0)) if rig else 0.0
+    offset_s = rig.number("lidar.time_offset") if rig else 0.0
     return Truth(path, len(labels), offset_ns=int(round(offset_s * 1e9)))
 
 
-def _evaluate_drive(options: Any, results: Results, workspace: str) -> str:
-    rig = Rig(options.rig, options.settings) if options.rig else None
-    title = "Evaluation of %s" % ", ".join(os.path.basename(bag) for bag in options.bags)
-    if options.masks:
-        assert rig is not None
-        results.add_masks(_compare_masks(options, rig, workspace))
-        return title
-    if rig is not None:
-        labels = rig.labels
-    else:
-        labels = scoring.class_set_of(options.clouds[0].partition("=")[2])
+def _rig(options: Options) -> Optional[Rig]:
+    """The rig that is named, or the one that the given clouds tell."""
+    if options.rig:
+        return Rig.load(options.rig, options.settings, options.fuse_bag)
+    with BagReader(options.clouds[0][1]) as bag:
+        return Rig.from_bag(bag)
+
+
+def _title(options: Options) -> str:
+    return "Evaluation of %s" % ", ".join(os.path.basename(bag) for bag in options.bags)
+
+
+def _name(bag: str) -> str:
+    return os.path.splitext(os.path.basename(bag))[0]
+
+
+def _evaluate_drives(options: Options, results: Results, workspace: str) -> str:
+    rig = _rig(options)
+    labels = rig.labels if rig else scoring.class_set_of(options.clouds[0][1])
+    fuser = Fuser(options, rig, workspace) if rig and not options.clouds else None
     drives: List[Tuple[str, List[Score]]] = []
-    rates: Optional[Visibility] = None
+    rates: Dict[str, Visibility] = {}
     for number, bag in enumerate(options.bags):
         truth = _truth(rig, options.truth or bag, labels)
         prefix = "%d_" % (number + 1) if len(options.bags) > 1 else ""
-        runs = _runs(options, rig, bag, workspace, prefix)
-        pair = tables.mask_pair([name for name, _ in runs])
-        if options.live:
-            runs.append(("live", options.live))
-        fused = [FusedBag(path, labels.names) for _, path in runs]
-        scores = [
-            scoring.score_bag(name, entry, truth, labels, options.min_edge_px)
-            for (name, _), entry in zip(runs, fused)
-        ]
-        drives.append((os.path.splitext(os.path.basename(bag))[0], scores))
-        if pair is not None:
-            rates = scoring.mask_visibility(fused[pair[0]], fused[pair[1]], truth, rates)
+        columns = _columns(options, fuser, bag, truth, prefix)
+        scores = [_score(options, column, truth, labels, rates) for column in columns]
+        drives.append((_name(bag), scores))
     results.add_scores(_sum(drives), rates)
     if len(drives) > 1:
         results.add_drives(drives)
     if options.live:
-        results.add_live(scoring.compare_clouds(fused[-2], fused[-1]), runs[-2][0])
+        ours, live = (FusedBag(column.path, labels.names) for column in columns[-2:])
+        results.add_live(scoring.compare_clouds(ours, live), columns[-2].name)
     if options.map:
-        _add_maps(results, options, [name for name, _ in runs], fused, truth, labels)
-    if options.fit_temperature:
-        assert rig is not None
+        _add_maps(results, options, columns, truth, labels)
+    if options.fit_temperature and fuser is not None:
         fit_bag = options.fit_on or bag
         fit_truth = _truth(rig, fit_bag, labels) if options.fit_on else truth
-        program = scoring.find_fuse_bag(options.fuse_bag)
-        common = list(options.settings) + scoring.required_settings(rig)
-        _compare(results, program, rig, (fit_bag, fit_truth), (bag, truth), common, workspace)
-    return title
+        _compare(results, fuser, (fit_bag, fit_truth), (bag, truth), workspace)
+    return _title(options)
 
 
-def _runs(
-    options: Any, rig: Optional[Rig], bag: str, workspace: str, prefix: str
-) -> List[Tuple[str, str]]:
-    """Name and fused bag of each configuration of a drive."""
-    if options.clouds:
-        return [(text.partition("=")[0], text.partition("=")[2]) for text in options.clouds]
-    assert rig is not None
-    return [
-        (configuration.name, _fuse(options, rig, bag, workspace, prefix, configuration))
-        for configuration in rig.configurations()
-    ]
+def _columns(
+    options: Options, fuser: Optional[Fuser], bag: str, truth: Truth, prefix: str
+) -> List[Column]:
+    """The configurations of a drive, fused."""
+    columns: List[Column] = []
+    if fuser is None:
+        for name, path in options.clouds:
+            # Of two runs in order, the second one named for a mask differs from the first in it.
+            before = columns[-1].path if columns and "mask" in name else None
+            columns.append(Column(name, path, before))
+    else:
+        wanted = scoring.configurations(fuser.rig, options.paper)
+        wanted += scoring.bounds(fuser.rig) if options.bounds else []
+        made = {entry.name: fuser.fuse(bag, entry, prefix) for entry in wanted}
+        for entry in wanted:
+            without = made.get(entry.without_mask or "")
+            if entry.name == PACKAGE and fuser.rig.text("occlusion.mode") != "off":
+                if truth.has_visibility:
+                    open_view = Configuration(PACKAGE + "_unmasked", ("occlusion.mode=off",))
+                    without = fuser.fuse(bag, open_view, prefix)
+            columns.append(Column(entry.name, made[entry.name], without))
+    if options.live:
+        columns.append(Column("live", options.live))
+    return columns
 
 
-def _fuse(
-    options: Any, rig: Rig, bag: str, workspace: str, prefix: str, configuration: Configuration
-) -> str:
-    program = scoring.find_fuse_bag(options.fuse_bag)
-    target = os.path.join(workspace, "%s%s.bag" % (prefix, configuration.name))
-    settings = list(options.settings) + scoring.required_settings(rig)
-    scoring.run_fuse_bag(program, bag, target, rig.path, settings + list(configuration.settings))
-    return target
+def _score(
+    options: Options,
+    column: Column,
+    truth: Truth,
+    labels: LabelSet,
+    rates: Dict[str, Visibility],
+) -> Score:
+    """The score of a column; what its mask catches and loses is added to `rates`."""
+    fused = FusedBag(column.path, labels.names)
+    score = scoring.score_bag(column.name, fused, truth, labels, options.min_edge_px)
+    if column.unmasked is not None:
+        unmasked = FusedBag(column.unmasked, labels.names)
+        score.labelled_without_mask = scoring.labelled_points(unmasked)
+        known = scoring.mask_visibility(unmasked, fused, truth, rates.get(column.name))
+        if known is not None:
+            rates[column.name] = known
+    return score
 
 
 def _sum(drives: Sequence[Tuple[str, Sequence[Score]]]) -> List[Score]:
@@ -198,29 +298,30 @@ def _sum(drives: Sequence[Tuple[str, Sequence[Score]]]) -> List[Score]:
     return total
 
 
-def _compare_masks(options: Any, rig: Rig, workspace: str) -> List[Tuple[str, str, Visibility]]:
-    """(drive, mask, what it does) for every drive and every mask of scoring.MASKS."""
-    result = []
+def _evaluate_masks(options: Options, results: Results, workspace: str) -> str:
+    """What every mask of scoring.MASKS does on every drive."""
+    rig = Rig.load(options.rig or "", options.settings, options.fuse_bag)
+    fuser = Fuser(options, rig, workspace)
+    compared: List[Tuple[str, str, Visibility]] = []
     for bag in options.bags:
         truth = _truth(rig, bag, rig.labels)
-        drive = os.path.splitext(os.path.basename(bag))[0]
         open_view = Configuration("unmasked", ("occlusion.mode=off",))
-        unmasked = FusedBag(_fuse(options, rig, bag, workspace, "", open_view), rig.labels.names)
+        unmasked = FusedBag(fuser.fuse(bag, open_view), rig.labels.names)
         for mask in scoring.MASKS:
             target = Configuration("masked", mask.settings)
-            masked = FusedBag(_fuse(options, rig, bag, workspace, "", target), rig.labels.names)
+            masked = FusedBag(fuser.fuse(bag, target), rig.labels.names)
             rates = scoring.mask_visibility(unmasked, masked, truth)
             if rates is None:
                 raise DataError("%s: its points_truth has no field visible" % bag)
-            result.append((drive, mask.name, rates))
-    return result
+            compared.append((_name(bag), mask.name, rates))
+    results.add_masks(compared)
+    return _title(options)
 
 
 def _add_maps(
     results: Results,
-    options: Any,
-    names: Sequence[str],
-    fused: Sequence[FusedBag],
+    options: Options,
+    columns: Sequence[Column],
     truth: Truth,
     labels: LabelSet,
 ) -> None:
@@ -233,9 +334,11 @@ def _add_maps(
         transforms_of,
     )
 
+    fused = [FusedBag(column.path, labels.names) for column in columns if column.name != "live"]
     drive = Drive(fused[-1].path, tuple(options.bags))
     frame_id = choose_frame(drive, first_cloud(drive), options.frame)
     config = MapConfig(voxel_size_m=options.voxel).checked(len(labels))
+    names = [column.name for column in columns if column.name != "live"]
     compared = map_scoring.evaluate_maps(
         names, fused, truth, labels, transforms_of(drive), frame_id, config
     )
@@ -246,13 +349,12 @@ def _add_maps(
 
 def _compare(
     results: Results,
-    program: str,
-    rig: Rig,
+    fuser: Fuser,
     fit: Tuple[str, Truth],
     report: Tuple[str, Truth],
-    settings: Sequence[str],
     workspace: str,
 ) -> None:
+    """Adds the comparison of temperatures; `fit` and `report`: bag and truth."""
     split = fit[0] == report[0]
     if split and len(report[1].stamps_ns) < 2:
         raise DataError(
@@ -260,10 +362,10 @@ def _compare(
             % report[0]
         )
     compared = scoring.compare_temperatures(
-        program,
-        CalibrationCase(fit[0], rig, fit[1], 0 if split else None),
-        CalibrationCase(report[0], rig, report[1], 1 if split else None),
-        settings,
+        fuser.program,
+        CalibrationCase(fit[0], fuser.rig, fit[1], 0 if split else None),
+        CalibrationCase(report[0], fuser.rig, report[1], 1 if split else None),
+        fuser.settings,
         workspace,
     )
     source = "the even scans" if split else os.path.basename(fit[0])
@@ -275,22 +377,21 @@ def _compare(
     results.add_temperatures(compared, note)
 
 
-def _evaluate_images(options: Any, results: Results, workspace: str) -> str:
-    labels = LabelSet.from_file(options.classes)
-    program = scoring.find_fuse_bag(options.fuse_bag)
-    images = image_truth.find_images(options.images, options.label_suffix)
+def _evaluate_images(options: Options, results: Results, workspace: str) -> str:
+    folder, model, classes = options.images or "", options.model or "", options.classes or ""
+    labels = LabelSet.from_file(classes)
+    images = image_truth.find_images(folder, options.label_suffix)
     bag, path = os.path.join(workspace, "images.bag"), os.path.join(workspace, "images.yaml")
-    image_truth.write_bag(images, labels, options.model, options.pixel_step, bag, path)
-    rig = Rig(path, options.settings)
-    truth = _truth(rig, bag, labels)
-    target = os.path.join(workspace, "fused.bag")
-    scoring.run_fuse_bag(program, bag, target, path, options.settings)
+    image_truth.write_bag(images, labels, model, options.pixel_step, bag, path)
+    fuser = Fuser(options, Rig.load(path, options.settings, options.fuse_bag), workspace)
+    truth = _truth(fuser.rig, bag, labels)
+    target = fuser.fuse(bag, Configuration("pixels", ()))
     score = scoring.score_bag("pixels", FusedBag(target, labels.names), truth, labels)
-    results.add_scores([score], None)
+    results.add_scores([score], {})
     if options.fit_temperature:
-        _compare(results, program, rig, (bag, truth), (bag, truth), options.settings, workspace)
+        _compare(results, fuser, (bag, truth), (bag, truth), workspace)
     return "Evaluation of %s on %d images of %s" % (
-        os.path.basename(options.model),
+        os.path.basename(model),
         len(images),
-        os.path.basename(os.path.abspath(options.images)),
+        os.path.basename(os.path.abspath(folder)),
     )

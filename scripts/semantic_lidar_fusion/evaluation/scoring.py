@@ -9,20 +9,27 @@ discarded prediction is a miss, never a false positive.
 
 import json
 import os
-import shutil
 import subprocess
 import sys
-from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Dict, Iterator, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
 from semantic_lidar_fusion import cli
+from semantic_lidar_fusion.evaluation import bootstrap
 from semantic_lidar_fusion.bags.bag_io import BagReader, to_ns
 from semantic_lidar_fusion.evaluation.calibration import Samples, Variant, fit_temperature
 from semantic_lidar_fusion.bags.cloud_io import SemanticCloud, require_fields, to_array, xyz
 from semantic_lidar_fusion.errors import ConfigError, DataError
-from semantic_lidar_fusion.labels import NO_LABEL, LabelSet, load_yaml
-from semantic_lidar_fusion.evaluation.metrics import Confusion, Reliability, Visibility
+from semantic_lidar_fusion.labels import NO_LABEL, LabelSet
+from semantic_lidar_fusion.evaluation.metrics import (
+    Confusion,
+    Reliability,
+    Visibility,
+    VisibleConfusion,
+    mean_over_rows,
+)
+from semantic_lidar_fusion.rig import Rig
 
 TRUTH_TOPIC = "/points_truth"
 CLOUD_TOPIC = "/points_semantic"
@@ -39,51 +46,78 @@ class Configuration(NamedTuple):
 
     name: str
     settings: Tuple[str, ...]
+    # Name of the configuration that differs from it in the mask alone, if there is one.
+    without_mask: Optional[str] = None
+    truth: Tuple[str, ...] = ()  # what fuse_bag takes from the bag's truth
 
 
-class Rig:
-    """What the evaluation needs of a rig file (which fuse_bag checks), with its overrides."""
+# The settings of the paper, whatever the rig says, for the keys that the loader knows. A mask of
+# fixed angles is that of the paper's lidar (VLP-16); other lidars' steps are those of their data.
+PAPER = (
+    ("image_choice", "closest_to_reference"),
+    ("reference.choose", "closest_image"),
+    ("motion.granularity", "firing"),
+    ("odometry.lookup", "interpolate"),
+    ("uncertainty.temperature", "1"),
+    ("uncertainty.exponent", "2"),
+    ("uncertainty.blend", "0"),
+    ("overlap", "mean"),
+    ("smoothing.iterations", "0"),
+)
+_PAPER_STEPS = {"VLP16": ("2", "0.1")}
 
-    def __init__(self, path: str, overrides: Sequence[str] = ()):
-        tree = load_yaml(path)
-        if not isinstance(tree, dict):
-            raise ConfigError("%s: must be a mapping" % path)
-        self.path = path
-        self._tree = tree
-        self._overrides = _overrides(overrides)
-        classes = tree.get("classes")
-        if isinstance(classes, dict) and "file" in classes:
-            file = os.path.join(os.path.dirname(os.path.abspath(path)), str(classes["file"]))
-            self.labels = LabelSet.from_file(file)
-        else:
-            self.labels = LabelSet.from_tree(classes, path + ": classes")
 
-    def value(self, section: str, key: str, default: Any) -> Any:
-        """section.key, or the key of the top level if `section` is empty."""
-        name = section + "." + key if section else key
-        if name in self._overrides:
-            return self._overrides[name]
-        tree = self._tree.get(section) if section else self._tree
-        return tree.get(key, default) if isinstance(tree, dict) else default
+def paper_settings(rig: Rig) -> Tuple[str, ...]:
+    """The overrides that make a rig fuse as the paper does, without its mask."""
+    return tuple("%s=%s" % setting for setting in PAPER if rig.has(setting[0]))
 
-    @property
-    def cameras(self) -> List[Dict[str, Any]]:
-        """The entries of `cameras`, in the order of their bits."""
-        cameras = self._tree.get("cameras") or []
-        return [c for c in cameras if isinstance(c, dict) and "name" in c]
 
-    def configurations(self) -> List[Configuration]:
-        """The columns of Table I: direct, motion, motion_mask; without motion (or mask) in the rig
-        file only those that differ."""
-        moving = bool(self.value("motion", "enabled", True))
-        masked = _text(self.value("occlusion", "mode", "adaptive")) != "off"
-        still, open_view = "motion.enabled=false", "occlusion.mode=off"
-        result = [Configuration("direct", (still, open_view))]
-        if moving:
-            result.append(Configuration("motion", (open_view,)))
-        if masked:
-            result.append(Configuration("motion_mask" if moving else "mask", ()))
-        return result
+def paper_mask(rig: Rig) -> Tuple[str, ...]:
+    """The overrides for the paper's mask."""
+    vertical, horizontal = _PAPER_STEPS.get(rig.text("lidar.model"), ("0", "0"))
+    return (
+        "occlusion.mode=paper",
+        "occlusion.vertical_step_deg=" + vertical,
+        "occlusion.horizontal_step_deg=" + horizontal,
+    )
+
+
+PAPER_EXPONENT = float(dict(PAPER)["uncertainty.exponent"])
+# The column of the rig as it is.
+PACKAGE = "package"
+
+
+def configurations(rig: Rig, paper_only: bool = False) -> List[Configuration]:
+    """The columns of Table I: the paper's direct, motion and motion_mask, then the rig as it is
+    (unless `paper_only`). A rig without motion has direct and mask instead."""
+    paper = paper_settings(rig)
+    still, open_view = ("motion.enabled=false",), ("occlusion.mode=off",)
+    result = [Configuration("direct", paper + still + open_view)]
+    if rig.flag("motion.enabled"):
+        result.append(Configuration("motion", paper + open_view))
+        result.append(Configuration("motion_mask", paper + paper_mask(rig), "motion"))
+    else:
+        result.append(Configuration("mask", paper + paper_mask(rig), "direct"))
+    return result if paper_only else result + [Configuration(PACKAGE, ())]
+
+
+# Odometry of no error: where the simulator's vehicle really was.
+_TRUE_ODOMETRY = (
+    "odometry.source=topic",
+    "odometry.topic=/truth/poses",
+    "odometry.time_offset=0",
+    "fixed_frame=world",
+)
+
+
+def bounds(rig: Rig) -> List[Configuration]:
+    """The rig as it is, but with what only a simulator knows: how much each step costs at most."""
+    seen = ("visibility",)
+    result = [Configuration("true_visibility", (), truth=seen)]
+    if rig.flag("motion.enabled"):
+        result.append(Configuration("true_odometry", _TRUE_ODOMETRY))
+        result.append(Configuration("true_both", _TRUE_ODOMETRY, truth=seen))
+    return result
 
 
 # The masks that evaluate.py --masks compares; the paper's has no angle but the one it is told.
@@ -108,60 +142,19 @@ MASKS = (
 )
 
 
-def _text(value: Any) -> str:
-    return "off" if value is False else str(value)  # YAML 1.1 reads a bare off as false
-
-
-def _overrides(settings: Sequence[str]) -> Dict[str, Any]:
-    import yaml
-
-    result = {}
-    for setting in settings:
-        key, equals, value = setting.partition("=")
-        if not equals or not key:
-            raise ConfigError("--set %s: must be KEY=VALUE" % setting)
-        result[key] = yaml.safe_load(value)
-    return result
-
-
-def find_fuse_bag(given: Optional[str] = None) -> str:
-    """The program: as given, from the folder SLF_BIN_DIR, beside the script, on the PATH, or where
-    catkin has put it."""
-    if given:
-        if not os.access(given, os.X_OK) or os.path.isdir(given):
-            raise ConfigError("--fuse-bag %s: not a program" % given)
-        return os.path.abspath(given)
-    folders = [os.environ.get("SLF_BIN_DIR", ""), os.path.dirname(os.path.abspath(sys.argv[0]))]
-    for folder in folders:
-        path = os.path.join(folder, "fuse_bag")
-        if folder and os.access(path, os.X_OK):
-            return path
-    on_path = shutil.which("fuse_bag")
-    if on_path:
-        return on_path
-    if shutil.which("catkin_find"):
-        found = subprocess.run(
-            ["catkin_find", "--first-only", "--libexec", "semantic_lidar_fusion", "fuse_bag"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            universal_newlines=True,
-        )
-        path = found.stdout.strip()
-        if path and os.access(path, os.X_OK):
-            return path
-    raise ConfigError(
-        "fuse_bag: not found beside this script, on the PATH, or by catkin_find; build the package "
-        "and source its setup.bash, or name the program with --fuse-bag"
-    )
-
-
 def run_fuse_bag(
-    program: str, bag: str, target: str, rig: str, settings: Sequence[str], all_topics: bool = False
+    program: str,
+    bag: str,
+    target: str,
+    rig: str,
+    settings: Sequence[str],
+    truth: Sequence[str] = (),
 ) -> None:
-    """Fuses a bag; DataError with the program's own words if it fails."""
+    """Fuses a bag; DataError with the program's own words if it fails. `truth`: what it takes from
+    the bag's truth instead of deciding itself ("visibility")."""
     command = [program, bag, target, "--rig", rig, "--force"]
     command += [] if sys.stderr.isatty() else ["--quiet"]
-    command += ["--all"] if all_topics else []
+    command += ["--truth", ",".join(truth)] if truth else []
     for setting in settings:
         command += ["--set", setting]
     result = subprocess.run(command, stderr=subprocess.PIPE, universal_newlines=True)
@@ -176,12 +169,14 @@ def run_fuse_bag(
 def class_set_of(path: str) -> LabelSet:
     """The classes that a fused bag names in its topic class_info."""
     with BagReader(path) as bag:
-        bag.require_topic("/class_info")
+        bag.require_topic("/class_info", "std_msgs/String")
         for item in bag.read(["/class_info"]):
             try:
                 return LabelSet.from_class_info(json.loads(item.message.data))
-            except ValueError as error:
+            except (ValueError, RecursionError) as error:
                 raise DataError("%s: class_info is not JSON (%s)" % (path, error)) from error
+            except ConfigError as error:
+                raise DataError("%s: %s" % (path, error)) from error
     raise DataError("%s: class_info is empty" % path)
 
 
@@ -203,16 +198,18 @@ class TruthScan(NamedTuple):
 
 
 class Truth:
-    """The truth of a bag, scan by scan."""
+    """The truth of a bag, scan by scan. has_visibility: it tells which cameras see each point."""
 
     def __init__(self, path: str, class_count: int, topic: str = TRUTH_TOPIC, offset_ns: int = 0):
         self.path, self.topic = path, topic
         self._classes, self._offset_ns = class_count, offset_ns
         with BagReader(path) as bag:
             bag.require_topic(topic, "sensor_msgs/PointCloud2")
-            self.stamps_ns = [
-                to_ns(item.message.header.stamp) + offset_ns for item in bag.read([topic])
-            ]
+            self.stamps_ns: List[int] = []
+            self.has_visibility = True
+            for item in bag.read([topic]):
+                self.stamps_ns.append(to_ns(item.message.header.stamp) + offset_ns)
+                self.has_visibility &= any(f.name == "visible" for f in item.message.fields)
         if not self.stamps_ns:
             raise DataError("%s: %s is empty" % (path, topic))
 
@@ -268,7 +265,7 @@ class FusedBag:
             bag.require_topic(CLOUD_TOPIC, "sensor_msgs/PointCloud2")
             first = {
                 to_ns(item.message.time_ref): to_ns(item.message.header.stamp)
-                for item in bag.read(["/scan_reference"])
+                for item in bag.read(["/scan_reference"], ["sensor_msgs/TimeReference"])
             }
             stamps = [to_ns(item.message.header.stamp) for item in bag.read([CLOUD_TOPIC])]
         self.first_ns = [first.get(stamp, stamp) for stamp in stamps]
@@ -323,6 +320,13 @@ def paired(
         yield index, cloud, scan
 
 
+class ScanCounts(NamedTuple):
+    """What one scan adds to a Score: (R, R + 1) counts of its fused points, and those for F1*."""
+
+    fused: np.ndarray
+    visible: Optional[VisibleConfusion]
+
+
 class Score:
     """Everything that is counted for one configuration."""
 
@@ -332,10 +336,16 @@ class Score:
         if not self.rows:
             raise ConfigError("the class set leaves no class to evaluate")
         self.confusion = Confusion(len(self.rows))
+        # Of points that a camera really sees; None until a truth tells which.
+        self.visible: Optional[VisibleConfusion] = None
+        # Counts of each scan, for intervals: matrices of `confusion` and of `visible`, intruders.
+        self.by_scan: List[ScanCounts] = []
         self.reliability = Reliability()
         self.status = np.zeros(len(STATUS_NAMES), dtype=np.int64)
         self.scans = 0
         self.without_truth = 0  # fused points whose truth is none or discarded
+        # Points that carried a class in the same run without its mask, where that was made.
+        self.labelled_without_mask: Optional[int] = None
         self._lookup, self._merge = labels.merge_lookup(), labels.merge_matrix()
         self._min_edge_px = min_edge_px
 
@@ -369,16 +379,77 @@ class Score:
             merged[index, np.minimum(predicted, len(self.rows) - 1)],
         )
         self.without_truth += int((truth == NO_LABEL).sum())
-        self.confusion.add(truth, predicted)
+        counted = Confusion(len(self.rows))
+        counted.add(truth, predicted)
+        self.confusion.merge(counted)
+        seen = self._count_visible(cloud, scan)
+        self.by_scan.append(ScanCounts(counted.matrix, seen))
         self.reliability.add(merged, truth, predicted, confidence)
+
+    def _count_visible(self, cloud: SemanticCloud, scan: TruthScan) -> Optional[VisibleConfusion]:
+        """Adds a scan to `visible`; returns its own counts, None without such a truth."""
+        flags = scan.flags("visible")
+        if flags is None:
+            return None
+        chosen = np.ones(len(cloud), dtype=bool)
+        if self._min_edge_px > 0:
+            chosen = scan.points["edge_px"] > self._min_edge_px
+        label = np.where(cloud.fused, cloud.label, NO_LABEL)[chosen]
+        counted = VisibleConfusion(len(self.rows))
+        counted.add(self._lookup[scan.label[chosen]], self._lookup[label], flags[chosen] != 0)
+        if self.visible is None:
+            self.visible = VisibleConfusion(len(self.rows))
+        self.visible.merge(counted)
+        return counted
+
+    @property
+    def f1_star(self) -> np.ndarray:
+        """(R,) F1*; NaN where the truth does not tell what cameras see."""
+        if self.visible is None:
+            return np.full(len(self.rows), np.nan)
+        return self.visible.f1
+
+    def f1_interval(self) -> Tuple[float, float]:
+        """95 % interval of the mean F1 over the rows."""
+        counts = np.array([scan.fused for scan in self.by_scan])
+
+        def score(matrix: np.ndarray) -> float:
+            confusion = Confusion(len(self.rows))
+            confusion.matrix = matrix
+            return mean_over_rows(confusion.f1)
+
+        return bootstrap.interval(counts, score)
+
+    def f1_star_interval(self) -> Tuple[float, float]:
+        """95 % interval of the mean F1* over the rows."""
+        scans = [scan.visible for scan in self.by_scan if scan.visible is not None]
+        if not scans or len(scans) != len(self.by_scan):
+            return float("nan"), float("nan")
+        counts = np.array(
+            [np.column_stack([scan.confusion.matrix, scan.intruders]) for scan in scans]
+        )
+
+        def score(table: np.ndarray) -> float:
+            visible = VisibleConfusion(len(self.rows))
+            visible.confusion.matrix, visible.intruders = table[:, :-1], table[:, -1]
+            return mean_over_rows(visible.f1)
+
+        return bootstrap.interval(counts, score)
 
     def merge(self, other: "Score") -> None:
         """Adds another drive's counts."""
         self.confusion.merge(other.confusion)
+        if other.visible is not None:
+            self.visible = self.visible or VisibleConfusion(len(self.rows))
+            self.visible.merge(other.visible)
+        self.by_scan += other.by_scan
         self.reliability.merge(other.reliability)
         self.status += other.status
         self.scans += other.scans
         self.without_truth += other.without_truth
+        if other.labelled_without_mask is not None:
+            before = self.labelled_without_mask or 0
+            self.labelled_without_mask = before + other.labelled_without_mask
 
     @property
     def points(self) -> int:
@@ -425,6 +496,11 @@ def mask_visibility(
         truths = (scan.flags(name) for name in ("catchable", "silhouette", "apart"))
         result.add(cameras[0], cameras[1], visible, *truths)
     return result
+
+
+def labelled_points(fused: FusedBag) -> int:
+    """Points of all clouds that carry a class."""
+    return sum(int(cloud.fused.sum()) for cloud in fused.clouds())
 
 
 def compare_clouds(offline: FusedBag, live: FusedBag) -> Tuple[int, int, int]:
@@ -480,7 +556,7 @@ def compare_temperatures(
     The constants are fitted to the points of `fit` and all four run on `report`, whole. `folder`
     takes the bags."""
     labels = report.rig.labels
-    exponent = float(report.rig.value("uncertainty", "exponent", 2.0)) or 2.0
+    exponent = report.rig.number("uncertainty.exponent") or PAPER_EXPONENT
 
     def fused(case: CalibrationCase, variant: Variant) -> FusedBag:
         target = os.path.join(folder, "temperature.bag")
@@ -515,12 +591,12 @@ def compare_temperatures(
 def required_settings(rig: Rig) -> List[str]:
     """Overrides without which clouds and truth would not hold the same points."""
     result = []
-    if rig.value("", "keep_unlabelled", True) is not True:
+    if not rig.flag("keep_unlabelled"):
         result.append("keep_unlabelled=true")
-    if rig.value("odometry", "on_missing", "mark") == "drop":
+    if rig.text("odometry.on_missing") == "drop":
         result.append("odometry.on_missing=mark")
-    for key in ("min_range_m", "max_range_m"):
-        if rig.value("lidar", key, 0):
-            cli.warn("lidar.%s is set aside: the truth holds every point" % key)
-            result.append("lidar.%s=0" % key)
+    for key in ("lidar.min_range_m", "lidar.max_range_m"):
+        if rig.number(key):
+            cli.warn("%s is set aside: the truth holds every point" % key)
+            result.append("%s=0" % key)
     return result

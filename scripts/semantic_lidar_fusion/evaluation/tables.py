@@ -4,11 +4,11 @@
 import csv
 import io
 import math
-from typing import Any, List, Optional, Sequence, Tuple
+from typing import Any, Dict, List, Sequence, Tuple
 
 from semantic_lidar_fusion.evaluation.calibration import Variant
 from semantic_lidar_fusion.evaluation.scoring import STATUS_NAMES, Score
-from semantic_lidar_fusion.evaluation.metrics import Visibility, ratio
+from semantic_lidar_fusion.evaluation.metrics import Visibility, mean_over_rows, ratio
 from semantic_lidar_fusion.figures.plotting import title_of
 
 
@@ -55,7 +55,7 @@ def table_one(scores: Sequence[Score]) -> str:
     for score in scores:
         header += ["%s: %s" % (score.name, what) for what in ("recall", "precision", "F1")]
     shown = present_rows(scores)
-    rows = []
+    rows: List[List[str]] = []
     for index in shown:
         row = [title_of(scores[0].rows[index])]
         for score in scores:
@@ -63,11 +63,35 @@ def table_one(scores: Sequence[Score]) -> str:
             for values in (confusion.recall, confusion.precision, confusion.f1):
                 row.append(number(float(values[index])))
         rows.append(row + [str(int(scores[-1].confusion.support[index]))])
-    text = markdown(header + ["points"], rows)
+    mean = ["mean"]
+    for score in scores:
+        mean += ["", "", number(mean_over_rows(score.confusion.f1))]
+    text = markdown(header + ["points"], rows + [mean + [""]])
     absent = [name for index, name in enumerate(scores[0].rows) if index not in shown]
     if absent:
         text += "\nNeither in the truth nor predicted: %s.\n" % ", ".join(absent)
     return text
+
+
+def f1_star(scores: Sequence[Score]) -> str:
+    """F1 and F1* of each class, two columns a configuration; "" where no truth tells what cameras
+    see."""
+    if all(score.visible is None for score in scores):
+        return ""
+    header = ["class"]
+    for score in scores:
+        header += ["%s: F1" % score.name, "%s: F1*" % score.name]
+    rows = []
+    for index in present_rows(scores):
+        row = [title_of(scores[0].rows[index])]
+        for score in scores:
+            row += [number(float(score.confusion.f1[index])), number(float(score.f1_star[index]))]
+        seen = scores[-1].visible
+        rows.append(row + ["-" if seen is None else str(int(seen.confusion.support[index]))])
+    mean = ["mean"]
+    for score in scores:
+        mean += [number(mean_over_rows(v)) for v in (score.confusion.f1, score.f1_star)]
+    return markdown(header + ["seen points"], rows + [mean + [""]])
 
 
 def present_rows(scores: Sequence[Score]) -> List[int]:
@@ -81,13 +105,13 @@ def table_one_csv(scores: Sequence[Score]) -> str:
     for score in scores:
         confusion = score.confusion
         for index, name in enumerate(score.rows):
-            values = [confusion.recall, confusion.precision, confusion.f1]
+            values = [confusion.recall, confusion.precision, confusion.f1, score.f1_star]
             rows.append(
                 [name, score.name]
                 + [float(value[index]) for value in values]
                 + [int(confusion.support[index])]
             )
-    header = ["class", "configuration", "recall", "precision", "f1", "points"]
+    header = ["class", "configuration", "recall", "precision", "f1", "f1_star", "points"]
     return csv_text(header, rows)
 
 
@@ -101,28 +125,25 @@ _SUMMARY = (
     ["configuration", "scans", "points", "labelled", "removed_by_mask"]
     + list(STATUS_NAMES[1:])
     + ["without_truth", "scored", "accuracy", "nll", "brier", "ece"]
+    + ["mean_f1", "mean_f1_low", "mean_f1_high"]
+    + ["mean_f1_star", "mean_f1_star_low", "mean_f1_star_high"]
 )
 
 
-def mask_pair(names: Sequence[str]) -> Optional[Tuple[int, int]]:
-    """The runs that differ in the mask alone: the last one named for it, and the one before."""
-    masked = [index for index, name in enumerate(names) if index and "mask" in name]
-    return (masked[-1] - 1, masked[-1]) if masked else None
-
-
 def _summary_rows(scores: Sequence[Score]) -> List[List[Any]]:
-    pair = mask_pair([score.name for score in scores])
     rows: List[List[Any]] = []
-    for index, score in enumerate(scores):
+    for score in scores:
         removed = float("nan")
-        if pair is not None and index == pair[1]:
-            before = scores[pair[0]].labelled
+        if score.labelled_without_mask is not None:
+            before = score.labelled_without_mask
             removed = float(ratio(before - score.labelled, before))
         rows.append(
             [score.name, score.scans, score.points, score.labelled, removed]
             + [int(count) for count in score.status[1:]]
             + [score.without_truth, score.confusion.total, score.confusion.accuracy]
             + [score.reliability.nll, score.reliability.brier, score.reliability.ece]
+            + [mean_over_rows(score.confusion.f1), *score.f1_interval()]
+            + [mean_over_rows(score.f1_star), *score.f1_star_interval()]
         )
     return rows
 
@@ -144,13 +165,17 @@ def summary_csv(scores: Sequence[Score]) -> str:
     return csv_text(_SUMMARY, _summary_rows(scores))
 
 
-def visibility(rates: Visibility) -> str:
-    rows = [[what, points, number(share, 4)] for what, points, share in rates.rows()]
-    return markdown(["mask", "of points", "share"], rows)
+def visibility(rates: Dict[str, Visibility]) -> str:
+    """What the masks of configurations catch and lose."""
+    rows = []
+    for name, rate in rates.items():
+        rows += [[name, what, points, number(share, 4)] for what, points, share in rate.rows()]
+    return markdown(["configuration", "mask", "of points", "share"], rows)
 
 
-def visibility_csv(rates: Visibility) -> str:
-    return csv_text(["what", "points", "share"], rates.rows())
+def visibility_csv(rates: Dict[str, Visibility]) -> str:
+    rows = [[name] + row for name, rate in rates.items() for row in rate.rows()]
+    return csv_text(["configuration", "what", "points", "share"], rows)
 
 
 def masks(results: Sequence[Tuple[str, str, Visibility]]) -> str:

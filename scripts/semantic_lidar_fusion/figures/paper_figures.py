@@ -14,10 +14,11 @@ from semantic_lidar_fusion.bags.bag_io import BagReader, to_ns
 from semantic_lidar_fusion.cameras import Camera
 from semantic_lidar_fusion.bags.cloud_io import FUSED, OCCLUDED, SemanticCloud
 from semantic_lidar_fusion.errors import ConfigError, DataError
-from semantic_lidar_fusion.evaluation.scoring import CLOUD_TOPIC, Rig
+from semantic_lidar_fusion.evaluation.scoring import CLOUD_TOPIC
 from semantic_lidar_fusion.labels import LabelSet
 from semantic_lidar_fusion.figures.plotting import title_of
 from semantic_lidar_fusion.bags.poses import TransformTree, invert, transform_points
+from semantic_lidar_fusion.rig import CameraConfig, Rig
 
 FIGURES = ("2", "3", "5", "6")
 _TOP_VIEW_M = 40.0
@@ -141,14 +142,18 @@ def _info(bags: List[BagReader], topic: str, stamp_ns: int) -> Any:
 
 
 def load_scene(
-    fused_path: str, source_path: Optional[str], rig: Rig, scan: Optional[int] = None
+    fused_path: str, source_path: Optional[str], rig: Optional[Rig], scan: Optional[int] = None
 ) -> Scene:
     """Reads a scan (default: the one in the middle) of a bag that fuse_bag --all has written.
 
-    Images, camera_info and tf come from `source_path`, the bag that was fused."""
+    Images, camera_info and tf come from `source_path`, the bag that was fused; the rig from the
+    fused bag itself if `rig` is None."""
     bags = [BagReader(fused_path)] + ([BagReader(source_path)] if source_path else [])
     try:
         fused = bags[0]
+        rig = rig or Rig.from_bag(fused)
+        if rig is None:
+            raise DataError("%s: does not tell its rig; name the file with --rig" % fused_path)
         fused.require_topic(CLOUD_TOPIC, "sensor_msgs/PointCloud2")
         count = fused.count([CLOUD_TOPIC])
         number = count // 2 if scan is None else scan
@@ -166,7 +171,7 @@ def load_scene(
                 first_ns = to_ns(item.message.header.stamp)
         tree = TransformTree()
         for bag in bags:
-            if len(tree._parents) == 0:
+            if len(tree) == 0:
                 tree = TransformTree.from_bag(bag)
         views = [
             _load_view(bags, tree, rig, bit, entry, cloud, first_ns)
@@ -183,18 +188,11 @@ def _load_view(
     tree: TransformTree,
     rig: Rig,
     bit: int,
-    entry: Dict[str, Any],
+    entry: CameraConfig,
     cloud: SemanticCloud,
     first_ns: int,
 ) -> View:
-    name = str(entry["name"])
-    space = str(entry.get("namespace", "/" + name)).rstrip("/")
-    space = space if space.startswith("/") else "/" + space
-
-    def topic(key: str) -> str:
-        value = str(entry.get(key, key))
-        return value if value.startswith("/") else space + "/" + value
-
+    name = entry.name
     stamp_ns = 0
     for item in bags[0].read(["/%s/selection" % name]):
         if to_ns(item.message.header.stamp) == first_ns:
@@ -204,20 +202,18 @@ def _load_view(
         for key in ("superpixels", "share", "probabilities"):
             message = _last_at(bags, ["/%s/%s" % (name, key)], stamp_ns)
             got[key] = None if message is None else image_array(message)
-        message = _last_at(bags, ["/%s/scores" % name, topic("scores")], stamp_ns)
+        message = _last_at(bags, ["/%s/scores" % name, entry.scores], stamp_ns)
         if message is not None:
             got["scores"] = image_array(message).astype(np.float32)
-        compressed = topic("image") + "/compressed"
-        order = [topic("image"), compressed]
+        order = [entry.image, entry.image + "/compressed"]
         message = _last_at(bags, order, stamp_ns)
         got["image"] = None if message is None else rgb_of(message)
     camera, to_camera, to_vehicle = None, None, None
-    info = _info(bags, topic("camera_info"), stamp_ns)
+    info = _info(bags, entry.camera_info, stamp_ns)
     if info is not None and stamp_ns:
-        camera = Camera(info, bool(entry.get("rectified", False)))
+        camera = Camera(info, entry.rectified)
         to_camera = _to_camera(tree, rig, camera.frame_id, cloud, stamp_ns)
-        vehicle = str(rig.value("", "vehicle_frame", "base_link"))
-        to_vehicle = _static(tree, vehicle, camera.frame_id)
+        to_vehicle = _static(tree, rig.text("vehicle_frame"), camera.frame_id)
     return View(
         name,
         bit,
@@ -245,8 +241,8 @@ def _to_camera(
 ) -> Optional[np.ndarray]:
     """From the lidar at t_ref to the camera at its image, by the vehicle's motion where tf has it
     and the rig file uses it; else the rigid transform."""
-    fixed = str(rig.value("", "fixed_frame", "odom"))
-    if rig.value("motion", "enabled", True):
+    fixed = rig.text("fixed_frame")
+    if rig.flag("motion.enabled"):
         try:
             lidar, known = tree.lookup(fixed, cloud.frame_id, np.array([cloud.stamp_ns]))
             camera, covered = tree.lookup(fixed, frame, np.array([stamp_ns]))

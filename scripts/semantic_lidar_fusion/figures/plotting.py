@@ -177,17 +177,19 @@ def draw_f1(
     path: str,
     rows: Sequence[str],
     shown: Sequence[int],
-    scores: Sequence[Tuple[str, Confusion]],
+    scores: Sequence[Tuple[str, np.ndarray]],
+    what: str,
 ) -> None:
-    """F1 of each class, one bar per configuration. `shown`: the rows to draw."""
+    """A score of each class (R,), one bar per configuration. `shown`: the rows to draw; `what`:
+    the score's name."""
     plt = pyplot()
     figure, axis = plt.subplots(figsize=(7.0, 2.4))
     width = 0.8 / len(scores)
     place = np.arange(len(shown))
-    for number, (name, confusion) in enumerate(scores):
+    for number, (name, values) in enumerate(scores):
         axis.bar(
             place + (number - (len(scores) - 1) / 2) * width,
-            np.nan_to_num(confusion.f1)[list(shown)],
+            np.nan_to_num(values)[list(shown)],
             width,
             label=title_of(name),
             color=COLORS[number % len(COLORS)],
@@ -197,7 +199,7 @@ def draw_f1(
     labels: List[str] = [title_of(rows[i]).replace(" ", "\n") for i in shown]
     axis.set_xticks(place)
     axis.set_xticklabels(labels, rotation=0 if len(shown) < 10 else 45)
-    axis.set(ylim=(0, 1), ylabel="F1")
+    axis.set(ylim=(0, 1), ylabel=what)
     axis.tick_params(axis="x", length=0)
     axis.yaxis.grid(True, linewidth=0.4, alpha=0.5)
     axis.set_axisbelow(True)
