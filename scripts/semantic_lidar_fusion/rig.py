@@ -104,6 +104,11 @@ class Rig:
                 raise DataError(str(error)) from error
         return None
 
+    @property
+    def tree(self) -> Dict[str, Any]:
+        """The resolved rig as plain values."""
+        return self._tree
+
     def has(self, key: str) -> bool:
         """Whether the loader knows a key ("occlusion.mode")."""
         tree: Any = self._tree

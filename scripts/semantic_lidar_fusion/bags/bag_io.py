@@ -255,9 +255,26 @@ class BagReader:
         for topic, message, stamp in self._guarded(entries):
             yield BagMessage(_absolute(topic), message, to_ns(stamp))
 
-    def read_raw(self, label: Optional[str] = None) -> Iterator[RawMessage]:
-        """All messages in order of record time, not decoded; `label` as in read()."""
-        entries: Iterable[Any] = self._bag.read_messages(raw=True, return_connection_header=True)
+    def read_raw(
+        self,
+        topics: Optional[Sequence[str]] = None,
+        start_ns: Optional[int] = None,
+        end_ns: Optional[int] = None,
+        label: Optional[str] = None,
+    ) -> Iterator[RawMessage]:
+        """Messages in order of record time, not decoded; arguments as in read()."""
+        names = None
+        if topics is not None:
+            names = [recorded for name in topics for recorded in self._recorded_names.get(name, [])]
+            if not names:
+                return
+        entries: Iterable[Any] = self._bag.read_messages(
+            topics=names,
+            start_time=None if start_ns is None else to_stamp(max(0, start_ns)),
+            end_time=None if end_ns is None else to_stamp(end_ns),
+            raw=True,
+            return_connection_header=True,
+        )
         if label is not None:
             entries = cli.progress(entries, self.count(), label)
         for entry in self._guarded(entries):

@@ -178,6 +178,15 @@ class TransformTree:
             poses.append(pose)
             self._series.pop(child, None)
 
+    def stamps_ns(self, frame: str, ancestor: str) -> np.ndarray:
+        """Times (M,) ns, sorted, at which any moving edge between two frames has a reading."""
+        chain = self._chain(frame.lstrip("/"))
+        if ancestor.lstrip("/") not in chain:
+            return np.zeros(0, dtype=np.int64)
+        moving = chain[: chain.index(ancestor.lstrip("/"))]
+        stamps = [self._readings[child][0] for child in moving if child in self._readings]
+        return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *stamps]).astype(np.int64))
+
     def _chain(self, frame: str) -> List[str]:
         chain, seen = [frame], {frame}  # type: Tuple[List[str], Set[str]]
         while chain[-1] in self._parents:
