@@ -15,6 +15,9 @@ DEFAULT_CLASSES = {
     "semantickitti": "config/classes_semantickitti.yaml",
     "rellis": "config/classes_rellis.yaml",
     "usyd": "config/classes_usyd12.yaml",
+    "kitti360": "config/classes_cityscapes.yaml",
+    "nuscenes": "config/classes_cityscapes.yaml",
+    "acfr_calibration": "config/classes_usyd12.yaml",
 }
 
 
@@ -105,7 +108,43 @@ def make_parser():
     usyd.add_argument(
         "--jpeg-quality", type=_quality, default=92, metavar="Q", help="1 to 100 (default: 92)"
     )
-    for command in (kitti, semantickitti, rellis, usyd):
+    kitti360 = datasets.add_parser(
+        "kitti360",
+        help="a KITTI-360 drive",
+        description="A drive below the folder KITTI-360 (data_2d_raw, data_3d_raw, data_poses, "
+        "calibration): perspective cameras and fisheyes, scans, poses, and the labels of "
+        "data_2d_semantics and data_3d_semantics where they are.",
+    )
+    kitti360.add_argument(
+        "--drive", metavar="NAME", help="e.g. 0000 (default: the only one that is there)"
+    )
+    kitti360.add_argument(
+        "--cameras",
+        type=_names,
+        metavar="FOLDER,...",
+        help="of image_00 to image_03 (default: all)",
+    )
+    nuscenes = datasets.add_parser(
+        "nuscenes",
+        help="a nuScenes scene",
+        description="A scene of nuScenes v1.0 (the folder with v1.0-mini, samples, sweeps): six "
+        "cameras, all lidar sweeps, ego poses; with lidarseg, keyframes become points_truth.",
+    )
+    nuscenes.add_argument("--scene", metavar="NAME", help="e.g. scene-0061 (default: the first)")
+    nuscenes.add_argument(
+        "--cameras", type=_names, metavar="CHANNEL,...", help="e.g. CAM_FRONT (default: all six)"
+    )
+    calibration = datasets.add_parser(
+        "acfr_calibration",
+        help="poses of a camera-lidar calibration (cam_lidar_calibration)",
+        description="A folder of ACFR's calibration tool (images, pcd, camera_info.yaml, calibration "
+        "runs as CSV), or its compact form: a standing vehicle, one pose a second.",
+    )
+    calibration.add_argument(
+        "--camera-info", metavar="FILE", help="default: camera_info.yaml of DIR, DIR/cfg or above"
+    )
+    commands = (kitti, semantickitti, rellis, usyd, kitti360, nuscenes, calibration)
+    for command in commands:
         what = (
             "the bag, or its folder" if command is usyd else "the folder of the drive or sequence"
         )
@@ -173,21 +212,21 @@ def _positive(text):
 
 def read_drive(options, labels):
     """The records.Drive that the options ask for."""
-    from semantic_lidar_fusion.datasets import kitti, rellis, semantickitti
+    from semantic_lidar_fusion.datasets import acfr_calibration, kitti, kitti360
+    from semantic_lidar_fusion.datasets import nuscenes, rellis, semantickitti
 
+    span = (options.first, options.last)
     if options.dataset == "kitti":
-        return kitti.read(options.folder, labels, options.cameras, options.first, options.last)
+        return kitti.read(options.folder, labels, options.cameras, *span)
     if options.dataset == "semantickitti":
-        return semantickitti.read(
-            options.folder, labels, options.cameras, options.first, options.last
-        )
-    return rellis.read(
-        options.folder,
-        labels,
-        rellis.DISTORTIONS[options.distortion],
-        options.first,
-        options.last,
-    )
+        return semantickitti.read(options.folder, labels, options.cameras, *span)
+    if options.dataset == "kitti360":
+        return kitti360.read(options.folder, labels, options.drive, options.cameras, *span)
+    if options.dataset == "nuscenes":
+        return nuscenes.read(options.folder, labels, options.scene, options.cameras, *span)
+    if options.dataset == "acfr_calibration":
+        return acfr_calibration.read(options.folder, labels, options.camera_info, *span)
+    return rellis.read(options.folder, labels, rellis.DISTORTIONS[options.distortion], *span)
 
 
 def import_usyd(options, labels, rig_path):
@@ -218,7 +257,7 @@ def main():
     parser = make_parser()
     options = parser.parse_args()
     if options.dataset is None:
-        parser.error("name a data set: kitti, semantickitti, rellis or usyd")
+        parser.error("name a data set: %s" % ", ".join(DEFAULT_CLASSES))
     cli.require("numpy", "scipy", "yaml", "rosbag", "sensor_msgs.msg", "tf2_msgs.msg")
     from semantic_lidar_fusion.datasets import writer
     from semantic_lidar_fusion.labels import LabelSet, package_file

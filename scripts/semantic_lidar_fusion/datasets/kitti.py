@@ -22,15 +22,14 @@ origin at the first oxts reading, x east, y north, z up. The baseline of a recti
 in tf, so P of camera_info has no fourth column.
 """
 
-import calendar
 import os
 import re
-import time
 from typing import Callable, Dict, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
 from semantic_lidar_fusion.datasets import records
+from semantic_lidar_fusion.datasets.timed_frames import Frames, frames_of, read_times
 from semantic_lidar_fusion.bags import poses
 from semantic_lidar_fusion.cli import warn
 from semantic_lidar_fusion.errors import DataError
@@ -53,72 +52,6 @@ def read(
     if os.path.isfile(os.path.join(folder, _COMPACT_FILE)):
         return _read_compact(folder, labels, first, last)
     return _read_raw(os.path.abspath(folder), labels, cameras, first, last)
-
-
-def parse_time(text: str, where: str) -> int:
-    """ns of "2011-09-26 13:02:25.964389445", taken as UTC."""
-    match = re.match(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(?:\.(\d{1,9}))?\s*\Z", text)
-    if not match:
-        raise DataError("%s: '%s' is not YYYY-MM-DD hh:mm:ss.fffffffff" % (where, text.strip()))
-    try:
-        seconds = calendar.timegm(time.strptime(match.group(1), "%Y-%m-%d %H:%M:%S"))
-    except ValueError as error:
-        raise DataError("%s: %s" % (where, error)) from error
-    return seconds * 1000000000 + int((match.group(2) or "0").ljust(9, "0"))
-
-
-def _read_times(path: str) -> Dict[int, int]:
-    """Number -> time of a timestamps.txt (line 1 = number 0). A frame that was lost has an empty
-    line or none."""
-    lines = records.read_lines(records.require_file(path))
-    times = {
-        number: parse_time(line, "%s line %d" % (path, number + 1))
-        for number, line in enumerate(lines)
-        if line.strip()
-    }
-    if not times:
-        raise DataError("%s: empty" % path)
-    return times
-
-
-class _Frames(NamedTuple):
-    """Frames of a sensor by number: file and time (ns), and what those that are left out lack."""
-
-    files: Dict[int, str]
-    times: Dict[int, int]
-    gaps: Dict[int, str]
-
-    def within(self, first: int, last: Optional[int]) -> Dict[int, str]:
-        """The gaps from `first` to `last`."""
-        return {
-            n: why for n, why in self.gaps.items() if n >= first and (last is None or n <= last)
-        }
-
-
-def _frames(folder: str, endings: List[str]) -> _Frames:
-    """The frames of folder/data that are whole: recordings have gaps, and downloads are cut short.
-
-    Left out are frames without a file, with an empty one, without a time, and those whose time is
-    not after the one before."""
-    found = records.numbered_files(os.path.join(folder, "data"), endings)
-    times = _read_times(os.path.join(folder, "timestamps.txt"))
-    gaps: Dict[int, str] = {}
-    whole = []
-    for number in sorted(set(found) | set(times)):
-        if number not in found:
-            gaps[number] = "no file"
-        elif number not in times:
-            gaps[number] = "no time in timestamps.txt"
-        elif not os.path.getsize(found[number]) and os.path.isfile(found[number]):
-            gaps[number] = "its file is empty"
-        else:
-            whole.append(number)
-    kept = [whole[i] for i in records.rising([times[n] for n in whole])]
-    for number in set(whole) - set(kept):
-        gaps[number] = "its time is not after the one before it"
-    if not kept:
-        raise DataError("%s: no frame has both a file and a time" % folder)
-    return _Frames({n: found[n] for n in kept}, {n: times[n] for n in kept}, gaps)
 
 
 def mercator_poses(readings: np.ndarray) -> np.ndarray:
@@ -150,7 +83,7 @@ def mercator_poses(readings: np.ndarray) -> np.ndarray:
 
 
 def _read_oxts(folder: str) -> Tuple[np.ndarray, np.ndarray]:
-    frames = _frames(folder, [".txt"])
+    frames = frames_of(folder, [".txt"])
     records.say_gaps(folder, frames.gaps)
     rows = []
     for number, file in sorted(frames.files.items()):
@@ -172,7 +105,7 @@ def _read_rigid(path: str) -> np.ndarray:
 
 
 def _read_camera(
-    frames: _Frames, name: str, calibration: str, t_velo_cam0: np.ndarray, rectified: bool
+    frames: Frames, name: str, calibration: str, t_velo_cam0: np.ndarray, rectified: bool
 ) -> records.CameraRecord:
     """One camera; `t_velo_cam0` places the unrectified reference camera in the lidar's frame."""
     number = name[-2:]
@@ -216,9 +149,9 @@ def _scan_loader(
 
 def _read_scans(folder: str, first: int, last: Optional[int]) -> List[records.ScanRecord]:
     """The scans from number `first` to `last` whose sweep is known."""
-    frames = _frames(folder, [".bin", ".txt"])
-    start = _read_times(os.path.join(folder, "timestamps_start.txt"))
-    end = _read_times(os.path.join(folder, "timestamps_end.txt"))
+    frames = frames_of(folder, [".bin", ".txt"])
+    start = read_times(os.path.join(folder, "timestamps_start.txt"))
+    end = read_times(os.path.join(folder, "timestamps_end.txt"))
     gaps = frames.within(first, last)
     result = []
     odd = 0
@@ -251,13 +184,13 @@ def _read_scans(folder: str, first: int, last: Optional[int]) -> List[records.Sc
 
 def _camera_frames(
     folder: str, cameras: List[str], first: int, last: Optional[int], same_numbers: bool
-) -> Dict[str, _Frames]:
+) -> Dict[str, Frames]:
     """Image frames of each camera that has any. `same_numbers`: as those of the scans."""
-    found: Dict[str, _Frames] = {}
+    found: Dict[str, Frames] = {}
     problems = []
     for camera in cameras:
         try:
-            found[camera] = _frames(os.path.join(folder, camera), [".png", ".jpg"])
+            found[camera] = frames_of(os.path.join(folder, camera), [".png", ".jpg"])
         except DataError as error:
             problems.append(str(error))
             continue

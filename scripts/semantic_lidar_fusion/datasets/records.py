@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A data set in neutral form: what its readers give and the writer turns into a bag and a rig file.
 
-One reader per layout (kitti, semantickitti, rellis) fills a `Drive`; its
+One reader per layout (kitti, kitti360, semantickitti, rellis, nuscenes, acfr_calibration) fills a `Drive`; its
 images and scans are read only when they are written. Also here: what the readers share (listing and
 checking files, image headers, rings and times of spinning lidars).
 """
@@ -35,7 +35,8 @@ class ImageRecord(NamedTuple):
 class CameraRecord(NamedTuple):
     """A camera: `k` (3, 3), `d` distortion of `model` ("" = none), images in order of time.
 
-    `t_parent_camera` places the optical frame (x right, y down, z forward) in `parent`.
+    `t_parent_camera` places the optical frame (x right, y down, z forward) in `parent`. `lens`: file
+    that calibrates the lens in place of camera_info, or empty.
     """
 
     name: str
@@ -47,6 +48,7 @@ class CameraRecord(NamedTuple):
     d: Sequence[float]
     rectified: bool
     images: List[ImageRecord]
+    lens: str = ""
 
 
 class Scan(NamedTuple):

@@ -106,6 +106,9 @@ def rig_tree(drive: records.Drive, rig_path: str, options: Options) -> Dict[str,
             entry["transport"] = "compressed"
         if camera.rectified:
             entry["rectified"] = True
+        if camera.lens:
+            folder = os.path.dirname(os.path.abspath(rig_path))
+            entry["lens"] = {"file": os.path.relpath(os.path.abspath(camera.lens), folder)}
         cameras.append(entry)
     lidar: Dict[str, Any] = {"input": "points", "topic": drive.lidar_topic}
     tree: Dict[str, Any] = {
