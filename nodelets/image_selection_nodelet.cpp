@@ -54,6 +54,7 @@ class ImageSelectionNodelet : public FusionNodelet {
   void initialize() override {
     selector_ = std::make_unique<ScanSelector>(rig().selectorConfig());
     // The motion nodelet decodes the same messages, and counts.
+    epochs_ = watchedEpochs({rig().lidar.topic}, [this] { forget(); });
     lidar_ = std::make_unique<LidarDecoder>(rig().lidar, [](const std::string&, std::uint64_t) {});
     sweep_ = rig().image_choice == ImageChoice::kClosestToSweep;
     if (sweep_) tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
@@ -131,18 +132,24 @@ class ImageSelectionNodelet : public FusionNodelet {
 
   void onImage(int index, const Image& image, StampNs stamp) {
     Camera& camera = *cameras_[static_cast<std::size_t>(index)];
-    if (!usable(imageTopic(camera.config), stamp)) return;
-    camera.images.put(stamp, image);
-    trim(&camera);
-    offer(index, stamp);
+    if (!isStamped(imageTopic(camera.config), stamp)) return;
+    admit(epochs_.get(), imageTopic(camera.config), trueImageTime(camera, stamp),
+          [this, index, image, stamp, &camera] {
+            camera.images.put(stamp, image);
+            trim(&camera);
+            offer(index, stamp);
+          });
   }
 
   void onSemantics(int index, const sensor_msgs::Image& scores) {
     Camera& camera = *cameras_[static_cast<std::size_t>(index)];
     const StampNs stamp = stampNs(scores.header.stamp);
-    if (scores.data.empty() || !usable(semanticsTopic(rig(), camera.config), stamp)) return;
-    camera.semantics.put(stamp, true);
-    offer(index, stamp);
+    const std::string topic = semanticsTopic(rig(), camera.config);
+    if (scores.data.empty() || !isStamped(topic, stamp)) return;
+    admit(epochs_.get(), topic, trueImageTime(camera, stamp), [this, index, stamp, &camera] {
+      camera.semantics.put(stamp, true);
+      offer(index, stamp);
+    });
   }
 
   /// Lets an image be chosen once the parts of it that must be there have come.
@@ -178,11 +185,13 @@ class ImageSelectionNodelet : public FusionNodelet {
         return;
       }
       scan.interval = scanInterval(cloud);
-      if (!usable(rig().lidar.topic, scan.interval.first_ns)) return;
+      if (!isStamped(rig().lidar.topic, scan.interval.first_ns)) return;
       if (sweep_) scan.sweep_ns = sweepTimes(cloud);
     }
-    selector_->addScan(scan, now());
-    decide();
+    admit(epochs_.get(), rig().lidar.topic, scan.interval.first_ns, [this, scan] {
+      selector_->addScan(scan, now());
+      decide();
+    });
   }
 
   std::vector<std::optional<StampNs>> sweepTimes(const TimedCloud& cloud) {
@@ -201,32 +210,25 @@ class ImageSelectionNodelet : public FusionNodelet {
     return times;
   }
 
-  /// False for a stamp that cannot be used; starts anew after a clock jump.
-  bool usable(const std::string& topic, StampNs stamp) {
-    if (stamp <= 0) {
-      health().count("dropped: stamp 0 on " + topic);
-      error("stamp " + topic, topic + ": header.stamp is 0; it must be the time of measurement");
-      return false;
+  /// False for a stamp that cannot be used.
+  bool isStamped(const std::string& topic, StampNs stamp) {
+    if (stamp > 0) return true;
+    health().count("dropped: stamp 0 on " + topic);
+    error("stamp " + topic, topic + ": header.stamp is 0; it must be the time of measurement");
+    return false;
+  }
+
+  void forget() {
+    selector_->reset();
+    for (const auto& camera : cameras_) {
+      camera->images.clear();
+      camera->semantics.clear();
+      camera->sent.clear();
     }
-    switch (epoch_.observe(topic, stamp)) {
-      case StampVerdict::kCurrent:
-        return true;
-      case StampVerdict::kStale:
-        health().count("dropped: " + topic + " from before a clock jump");
-        return false;
-      case StampVerdict::kNewEpoch:
-        health().count("clock jumps");
-        NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
-                                              << " s: starting anew");
-        selector_->reset();
-        for (const auto& camera : cameras_) {
-          camera->images.clear();
-          camera->semantics.clear();
-          camera->sent.clear();
-        }
-        return true;
-    }
-    return true;
+  }
+
+  StampNs trueImageTime(const Camera& camera, StampNs stamp) const {
+    return stamp + toNs(camera.config.time_offset_s);
   }
 
   void tick(StampNs /*now_ns*/) override { decide(); }
@@ -246,11 +248,17 @@ class ImageSelectionNodelet : public FusionNodelet {
       guard("selection", [&] { publishSelection(decision); });
     }
     for (const DroppedScan& scan : decisions.dropped) {
-      if (scan.reason == DropReason::kQueueFull) {
-        health().count("dropped: scan, too many wait for images");
-        warn("overflow", "a scan is dropped: too many wait for images");
-      } else {
-        health().count("dropped: scan pending at a clock jump");
+      switch (scan.reason) {
+        case DropReason::kQueueFull:
+          health().count("dropped: scan, too many wait for images");
+          warn("overflow", "a scan is dropped: too many wait for images");
+          break;
+        case DropReason::kNewEpoch:
+          health().count("dropped: scan pending at a clock jump");
+          break;
+        case DropReason::kTooOld:
+          health().count("dropped: scan older than all that are remembered");
+          break;
       }
     }
     const std::uint64_t duplicates = selector_->counters().scans_duplicate;
@@ -299,7 +307,7 @@ class ImageSelectionNodelet : public FusionNodelet {
   std::unique_ptr<LidarDecoder> lidar_;
   std::unique_ptr<TfSubscription> tf_;
   bool sweep_ = false;
-  EpochMonitor epoch_;
+  std::unique_ptr<EpochMonitor> epochs_;
   std::vector<std::unique_ptr<Camera>> cameras_;
   std::uint64_t reported_duplicates_ = 0;
   ros::Publisher reference_;

@@ -20,12 +20,15 @@
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/stamped_store.h"
+#include "semantic_lidar_fusion/sync/waiting_room.h"
 
 namespace semantic_lidar_fusion {
 namespace {
 
 constexpr std::size_t kKnownReferences = 128;
 constexpr StampNs kReferenceGraceNs = 500000000;
+/// Points of all scans that wait: a bound of memory where large scans come too fast.
+constexpr std::size_t kPendingPoints = 8000000;
 
 }  // namespace
 
@@ -54,7 +57,8 @@ class MotionCompensationNodelet : public FusionNodelet {
         });
     // The selection nodelet settles t_ref within its own timeout; the rest is grace for its thread.
     longest_reference_wait_ns_ = toNs(rig().reference.timeout_s) + kReferenceGraceNs;
-    max_pending_ = scansThatWait(longest_reference_wait_ns_ + toNs(rig().odometry.timeout_s));
+    room_ = WaitingRoom(longest_reference_wait_ns_ + toNs(rig().odometry.timeout_s));
+    epochs_ = watchedEpochs({rig().lidar.topic}, [this] { forget(); });
     tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
     output_ = advertise<sensor_msgs::PointCloud2>(getNodeHandle(), "points_compensated", 4);
     startTicking();
@@ -80,24 +84,43 @@ class MotionCompensationNodelet : public FusionNodelet {
 
   template <class M>
   void onScan(const boost::shared_ptr<const M>& message) {
-    Scan scan;
+    const auto scan = std::make_shared<Scan>();
     {
       const StageTimer timer(health(), "decode");
-      scan.cloud = lidar_->decode(*message);
+      scan->cloud = lidar_->decode(*message);
     }
     reportTimeDecision();
-    scan.interval = scanInterval(scan.cloud);
-    scan.arrived_ns = now();
-    if (scan.interval.first_ns <= 0) {  // the selection nodelet says it; it is no jump of time
+    scan->interval = scanInterval(scan->cloud);
+    if (scan->interval.first_ns <= 0) {  // the selection nodelet says it; it is no jump of time
       health().count("dropped: scan of stamp 0");
       return;
     }
-    if (!current("lidar", scan.interval.first_ns)) return;
+    if (scan->cloud.empty()) {  // its stamp is that of the header, which is no measured time
+      enqueue(std::move(*scan));
+      return;
+    }
+    admit(epochs_.get(), rig().lidar.topic, scan->interval.first_ns, [this, scan] {
+      if (scan->interval.first_ns == last_first_ns_) {
+        health().count("dropped: scan of a known stamp");
+        return;
+      }
+      last_first_ns_ = scan->interval.first_ns;
+      room_.observe(last_first_ns_);
+      references_.grow(2 * room_.capacity());
+      enqueue(std::move(*scan));
+    });
+  }
+
+  void enqueue(Scan scan) {
+    scan.arrived_ns = now();
     pending_.push_back(std::move(scan));
-    if (pending_.size() > max_pending_) {
+    std::size_t points = 0;
+    for (const Scan& waiting : pending_) points += waiting.cloud.size();
+    while (pending_.size() > room_.capacity() || (pending_.size() > 1 && points > kPendingPoints)) {
+      points -= pending_.front().cloud.size();
       pending_.pop_front();
       health().count("dropped: scan, too many wait for odometry or scan_reference");
-      warn("pending", "a scan is dropped: " + std::to_string(max_pending_) +
+      warn("pending", "a scan is dropped: " + std::to_string(pending_.size()) +
                           " others wait for odometry or scan_reference");
     }
     release();
@@ -125,28 +148,19 @@ class MotionCompensationNodelet : public FusionNodelet {
 
   void onReference(const sensor_msgs::TimeReferenceConstPtr& message) {
     const StampNs scan_ns = stampNs(message->header.stamp);
-    if (!current("scan_reference", scan_ns)) return;
-    references_.put(scan_ns, {stampNs(message->time_ref), now()});
-    release();
+    admit(epochs_.get(), "scan_reference", scan_ns, [this, scan_ns, message] {
+      references_.put(scan_ns, {stampNs(message->time_ref), now()});
+      release();
+    });
   }
 
   void tick(StampNs /*now_ns*/) override { release(); }
 
-  /// False for what is from before a clock jump; forgets what is pending after one.
-  bool current(const std::string& source, StampNs stamp) {
-    const StampVerdict verdict = epoch_.observe(source, stamp);
-    if (verdict == StampVerdict::kNewEpoch) {
-      health().count("clock jumps");
-      health().count("dropped: scan pending at a clock jump", pending_.size());
-      pending_.clear();
-      references_.clear();
-      NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
-                                            << " s: starting anew");
-    }
-    if (verdict == StampVerdict::kStale) {
-      health().count("dropped: " + source + " from before a clock jump");
-    }
-    return verdict != StampVerdict::kStale;
+  void forget() {
+    health().count("dropped: scan pending at a clock jump", pending_.size());
+    pending_.clear();
+    references_.clear();
+    last_first_ns_ = 0;
   }
 
   /// Publishes the scans at the front of the queue that need not wait any longer.
@@ -217,10 +231,11 @@ class MotionCompensationNodelet : public FusionNodelet {
   std::unique_ptr<LidarDecoder> lidar_;
   std::string told_time_decision_;
   std::unique_ptr<TfSubscription> tf_;
-  EpochMonitor epoch_;
+  std::unique_ptr<EpochMonitor> epochs_;
+  StampNs last_first_ns_ = 0;  ///< of the last scan with points
   StampedStore<Reference> references_{kKnownReferences};
   std::deque<Scan> pending_;
-  std::size_t max_pending_ = 0;
+  WaitingRoom room_{0};
   StampNs longest_reference_wait_ns_ = 0;
   ros::Publisher output_;
   ros::Subscriber references_subscriber_, lidar_subscriber_;

@@ -59,13 +59,14 @@ class ProjectionNodelet : public FusionNodelet {
         rig(), PipelineSteps{PipelineStep::kView, PipelineStep::kFuse});
 
     FusionQueueConfig queue;
-    StampNs longest_wait_ns = 0;
     for (const CameraConfig& camera : rig().cameras) {
       queue.timeout_ns.push_back(toNs(camera.timeout_s));
-      longest_wait_ns = std::max(longest_wait_ns, queue.timeout_ns.back());
     }
-    queue.max_pending = scansThatWait(longest_wait_ns);
+    // A selection is settled within the longer of both waits, from the scan on.
+    queue.selection_grace_ns += toNs(rig().reference.timeout_s);
     queue_ = std::make_unique<FusionQueue>(queue);
+    // The selection nodelet has told jumps of the lidar's time from errors.
+    epochs_ = watchedEpochs({"scan_reference", 1}, [this] { forget(); });
     tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
 
     class_info_ = getNodeHandle().advertise<std_msgs::String>("class_info", 1, true);
@@ -142,30 +143,39 @@ class ProjectionNodelet : public FusionNodelet {
 
   void onReference(const sensor_msgs::TimeReferenceConstPtr& message) {
     const StampNs scan_ns = stampNs(message->header.stamp);
-    if (!current("scan_reference", scan_ns)) return;
-    queue_->addReference(scan_ns, stampNs(message->time_ref));
-    fuseComplete();
+    admit(epochs_.get(), "scan_reference", scan_ns, [this, scan_ns, message] {
+      queue_->addReference(scan_ns, stampNs(message->time_ref));
+      fuseComplete();
+    });
   }
 
   void onSelection(Camera* camera, const sensor_msgs::TimeReference& message) {
     const StampNs scan_ns = stampNs(message.header.stamp);
-    if (!current(camera->config.name + " selection", scan_ns)) return;
     const StampNs image_stamp = stampNs(message.time_ref);
-    queue_->addSelection(scan_ns, camera->index,
-                         image_stamp == 0 ? std::nullopt : std::make_optional(image_stamp));
-    fuseComplete();
+    admit(epochs_.get(), camera->config.name + " selection", scan_ns,
+          [this, camera, scan_ns, image_stamp] {
+            queue_->addSelection(scan_ns, camera->index,
+                                 image_stamp == 0 ? std::nullopt : std::make_optional(image_stamp),
+                                 now());
+            fuseComplete();
+          });
   }
 
   void onCloud(const sensor_msgs::PointCloud2ConstPtr& message) {
     const auto cloud = std::make_shared<const Cloud>(compensatedCloud(*message));
-    if (!current("points_compensated", cloud->stamp)) return;
-    const std::uint64_t dropped_before = queue_->droppedPending();
-    queue_->addCloud(cloud, now());
-    if (queue_->droppedPending() > dropped_before) {
-      health().count("dropped: scan, too many wait for cameras");
-      warn("pending", "a scan is dropped: too many others wait for cameras");
-    }
-    fuseComplete();
+    admit(epochs_.get(), "points_compensated", cloud->stamp, [this, cloud] {
+      const FusionQueueCounters before = queue_->counters();
+      queue_->addCloud(cloud, now());
+      const FusionQueueCounters& after = queue_->counters();
+      health().count("dropped: scan behind the last one, or known",
+                     after.out_of_order - before.out_of_order);
+      if (after.overflow > before.overflow) {
+        health().count("dropped: scan, too many wait for cameras",
+                       after.overflow - before.overflow);
+        warn("pending", "a scan is dropped: too many others wait for cameras");
+      }
+      fuseComplete();
+    });
   }
 
   void onScores(Camera* camera, const sensor_msgs::ImageConstPtr& message) {
@@ -182,15 +192,18 @@ class ProjectionNodelet : public FusionNodelet {
                     const sensor_msgs::ImageConstPtr& message,
                     sensor_msgs::ImageConstPtr Semantics::*part) {
     const StampNs stamp = stampNs(message->header.stamp);
-    if (!current(camera->config.name + " " + source, stamp)) return;
-    if (message->width == 0 || message->height == 0) {
-      health().problem(camera->config.name + ": the network gave no scores for a selected image");
-      queue_->setSemantics(camera->index, stamp, false);
-    } else {
-      if (camera->semantics.find(stamp) == nullptr) camera->semantics.put(stamp, {});
-      if (Semantics* known = camera->semantics.find(stamp)) known->*part = message;
-    }
-    fuseComplete();
+    admit(epochs_.get(), camera->config.name + " " + source, trueImageTime(*camera, stamp),
+          [this, camera, stamp, message, part] {
+            if (message->width == 0 || message->height == 0) {
+              health().problem(camera->config.name +
+                               ": the network gave no scores for a selected image");
+              queue_->setSemantics(camera->index, stamp, false);
+            } else {
+              if (camera->semantics.find(stamp) == nullptr) camera->semantics.put(stamp, {});
+              if (Semantics* known = camera->semantics.find(stamp)) known->*part = message;
+            }
+            fuseComplete();
+          });
   }
 
   void onImage(Camera* camera, const sensor_msgs::ImageConstPtr& message) {
@@ -199,24 +212,13 @@ class ProjectionNodelet : public FusionNodelet {
 
   void tick(StampNs /*now_ns*/) override { fuseComplete(); }
 
-  /// False for what is from before a clock jump; forgets what is pending after one.
-  bool current(const std::string& source, StampNs stamp) {
-    const StampVerdict verdict = epoch_.observe(source, stamp);
-    if (verdict == StampVerdict::kNewEpoch) {
-      health().count("clock jumps");
-      health().count("dropped: scan pending at a clock jump", queue_->pending());
-      queue_->reset();
-      for (const auto& camera : cameras_) {
-        camera->semantics.clear();
-        camera->images.clear();
-      }
-      NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
-                                            << " s: starting anew");
+  void forget() {
+    health().count("dropped: scan pending at a clock jump", queue_->pending());
+    queue_->reset();
+    for (const auto& camera : cameras_) {
+      camera->semantics.clear();
+      camera->images.clear();
     }
-    if (verdict == StampVerdict::kStale) {
-      health().count("dropped: " + source + " from before a clock jump");
-    }
-    return verdict != StampVerdict::kStale;
   }
 
   // --- Fusion
@@ -350,7 +352,7 @@ class ProjectionNodelet : public FusionNodelet {
   std::unique_ptr<ScanPipeline> pipeline_;
   std::unique_ptr<FusionQueue> queue_;
   std::unique_ptr<TfSubscription> tf_;
-  EpochMonitor epoch_;
+  std::unique_ptr<EpochMonitor> epochs_;
   std::vector<std::unique_ptr<Camera>> cameras_;
   ros::Publisher output_, class_info_;
   ros::Subscriber cloud_subscriber_, reference_subscriber_;

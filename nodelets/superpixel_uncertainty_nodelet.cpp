@@ -37,6 +37,8 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
   ~SuperpixelUncertaintyNodelet() override { stop(); }
 
  private:
+  using Outputs = std::vector<std::pair<const ros::Publisher*, sensor_msgs::ImagePtr>>;
+
   struct Image {
     sensor_msgs::ImageConstPtr message;
     SegmentedImage segmented;
@@ -48,7 +50,8 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     const std::size_t index;  ///< in the rig file
     std::mutex mutex;  ///< guards what follows, up to the publishers, and the pipeline's camera
     std::string told_clamping;
-    EpochMonitor epoch;
+    std::unique_ptr<EpochMonitor> epochs;
+    Outputs outputs;  ///< complete, to be published
     StampedStore<Image> images{kWaiting};
     StampedStore<sensor_msgs::ImageConstPtr> scores{kWaitingScores};
 
@@ -65,6 +68,11 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
       if (!only.empty() && config.name != only) continue;
       cameras_.push_back(std::make_unique<Camera>(config, i));
       Camera& camera = *cameras_.back();
+      // The selection nodelet has told jumps of the lidar's time from errors.
+      camera.epochs = watchedEpochs({config.name + " image_selected", 1}, [&camera] {
+        camera.images.clear();
+        camera.scores.clear();
+      });
       const auto output = [&](const std::string& name) {
         return advertise<sensor_msgs::Image>(getNodeHandle(), cameraTopic(config, name), 4);
       };
@@ -114,52 +122,40 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
   }
 
   void onImage(Camera* camera, const sensor_msgs::ImageConstPtr& image) {
-    Outputs outputs;
-    {
-      std::lock_guard<std::mutex> lock(camera->mutex);
-      if (!current(camera, "image", image)) return;
-      const StampNs stamp = stampNs(image->header.stamp);
+    take(camera, "image_selected", image, [this, camera, image](StampNs stamp) {
       Image waiting{image, {}};
       waiting.segmented.stamp = stamp;
       waiting.segmented.image = colorImage(image);
       health().count("dropped: " + camera->config.name + " image without scores",
                      camera->images.put(stamp, std::move(waiting)));
       if (Image* const stored = camera->images.find(stamp)) cluster(camera, &stored->segmented);
-      outputs = combine(camera, stamp);
-    }
-    publishAll(outputs);
+    });
   }
 
   void onScores(Camera* camera, const sensor_msgs::ImageConstPtr& scores) {
     if (scores->width == 0 || scores->height == 0) return;  // the network gave none for this image
+    take(camera, "scores", scores, [this, camera, scores](StampNs stamp) {
+      health().count(camera->config.name + " scores of images that no scan chose",
+                     camera->scores.put(stamp, scores));
+    });
+  }
+
+  /// Keeps a message by `keep`, unless its time is in doubt, and publishes what it makes complete.
+  void take(Camera* camera, const std::string& source, const sensor_msgs::ImageConstPtr& message,
+            const std::function<void(StampNs)>& keep) {
     Outputs outputs;
     {
       std::lock_guard<std::mutex> lock(camera->mutex);
-      if (!current(camera, "scores", scores)) return;
-      const StampNs stamp = stampNs(scores->header.stamp);
-      health().count(camera->config.name + " scores of images that no scan chose",
-                     camera->scores.put(stamp, scores));
-      outputs = combine(camera, stamp);
+      const StampNs stamp = stampNs(message->header.stamp);
+      admit(camera->epochs.get(), camera->config.name + " " + source, stamp,
+            [this, camera, stamp, keep] {
+              keep(stamp);
+              const Outputs complete = combine(camera, stamp);
+              camera->outputs.insert(camera->outputs.end(), complete.begin(), complete.end());
+            });
+      outputs.swap(camera->outputs);
     }
     publishAll(outputs);
-  }
-
-  /// False for what is from before a clock jump.
-  bool current(Camera* camera, const std::string& source, const sensor_msgs::ImageConstPtr& image) {
-    switch (camera->epoch.observe(source, stampNs(image->header.stamp))) {
-      case StampVerdict::kCurrent:
-        return true;
-      case StampVerdict::kStale:
-        health().count("dropped: " + camera->config.name + " " + source +
-                       " from before a clock jump");
-        return false;
-      case StampVerdict::kNewEpoch:
-        health().count("clock jumps");
-        camera->images.clear();
-        camera->scores.clear();
-        return true;
-    }
-    return true;
   }
 
   /// Superpixels as soon as their number of pixels is known, in parallel with the network.
@@ -178,8 +174,6 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     health().set(camera->config.name + " superpixels", note);
     NODELET_INFO_STREAM(camera->config.name << ": " << note);
   }
-
-  using Outputs = std::vector<std::pair<const ros::Publisher*, sensor_msgs::ImagePtr>>;
 
   /// What can be published for the images of one stamp, with the camera's mutex held.
   Outputs combine(Camera* camera, StampNs stamp) {

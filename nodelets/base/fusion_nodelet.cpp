@@ -12,7 +12,6 @@
 #include "base/parameters.h"
 #include "edge/version.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -20,6 +19,7 @@ namespace {
 const ros::WallDuration kTickPeriod(0.005);
 const ros::WallDuration kDiagnosticsPeriod(1.0);
 constexpr std::chrono::seconds kReportPeriod{30};
+constexpr std::chrono::seconds kJumpReportPeriod{1};
 /// Silence after which the watchdog speaks.
 constexpr std::chrono::seconds kSilence{5};
 constexpr auto kEver = std::chrono::duration<double>::max();
@@ -171,6 +171,33 @@ void FusionNodelet::guard(const std::string& where, const std::function<void()>&
   }
 }
 
+std::unique_ptr<EpochMonitor> FusionNodelet::watchedEpochs(const EpochConfig& config,
+                                                           const std::function<void()>& forget) {
+  const auto started_anew = [this, forget](StampNs stamp) {
+    health_.count("clock jumps");
+    if (mayReport("jump", kJumpReportPeriod)) {  // one line, not one for each camera
+      NODELET_INFO_STREAM("time jumped to " << std::to_string(toSeconds(stamp))
+                                            << " s: starting anew");
+    }
+    forget();
+  };
+  const auto discarded = [this, lead = config.lead](const DiscardedMessage& message) {
+    health_.count("dropped: " + message.source + ", stamp disagrees with " + lead);
+    const double ahead_s = toSeconds(message.ahead_ns);
+    warn("stamps " + message.source,
+         message.source + ": stamp " + std::to_string(toSeconds(message.stamp)) + " s is " +
+             std::to_string(std::abs(ahead_s)) + " s " + (ahead_s < 0 ? "behind" : "ahead of") +
+             " the newest of " + lead + "; dropped: is one of their clocks wrong, or " + lead +
+             " silent?");
+  };
+  return std::make_unique<EpochMonitor>(config, started_anew, discarded);
+}
+
+void FusionNodelet::admit(EpochMonitor* epochs, const std::string& source, StampNs true_ns,
+                          const std::function<void()>& work) {
+  epochs->observe(source, true_ns, [this, source, work] { guard(source, work); });
+}
+
 void FusionNodelet::reportOverflow(const std::string& topic) {
   health_.count("dropped: queue full, " + topic);
   warn("overflow " + topic, topic +
@@ -178,22 +205,22 @@ void FusionNodelet::reportOverflow(const std::string& topic) {
                                 "are dropped");
 }
 
-bool FusionNodelet::mayReport(const std::string& key) {
+bool FusionNodelet::mayReport(const std::string& key, std::chrono::seconds period) {
   std::lock_guard<std::mutex> lock(report_mutex_);
   const auto now = Health::Clock::now();
   const auto [entry, first] = reported_.emplace(key, now);
-  if (!first && now - entry->second < kReportPeriod) return false;
+  if (!first && now - entry->second < period) return false;
   entry->second = now;
   return true;
 }
 
 void FusionNodelet::warn(const std::string& key, const std::string& text) {
-  if (mayReport(key)) NODELET_WARN_STREAM(text);
+  if (mayReport(key, kReportPeriod)) NODELET_WARN_STREAM(text);
 }
 
 void FusionNodelet::error(const std::string& key, const std::string& text) {
   health_.error(text);
-  if (mayReport(key)) NODELET_ERROR_STREAM(text);
+  if (mayReport(key, kReportPeriod)) NODELET_ERROR_STREAM(text);
 }
 
 void FusionNodelet::watch() {

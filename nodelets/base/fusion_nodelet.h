@@ -12,6 +12,7 @@
 #include <nodelet/nodelet.h>
 #include <ros/ros.h>
 
+#include <chrono>
 #include <condition_variable>
 #include <exception>
 #include <functional>
@@ -24,6 +25,7 @@
 #include "base/health.h"
 #include "base/inbox.h"
 #include "semantic_lidar_fusion/config/rig.h"
+#include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
 namespace semantic_lidar_fusion {
 
@@ -155,13 +157,21 @@ class FusionNodelet : public nodelet::Nodelet {
     health_.published(publisher.getTopic());
   }
 
+  /// A monitor that counts and reports jumps of time and what it discards. `forget` drops what is
+  /// buffered.
+  std::unique_ptr<EpochMonitor> watchedEpochs(const EpochConfig& config,
+                                              const std::function<void()>& forget);
+  /// Hands a message to the monitor; `work` runs guarded, at once or when its epoch is clear.
+  void admit(EpochMonitor* epochs, const std::string& source, StampNs true_ns,
+             const std::function<void()>& work);
+
   /// Reports at once, then at most every 30 s for the same `key`.
   void warn(const std::string& key, const std::string& text);
   void error(const std::string& key, const std::string& text);
 
  private:
   void onInit() final;
-  bool mayReport(const std::string& key);
+  bool mayReport(const std::string& key, std::chrono::seconds period);
   void watch();
   /// How far the simulated clock has run, jumps apart, and how long it has stood still, both in ns.
   std::pair<StampNs, StampNs> simulatedClock() const;

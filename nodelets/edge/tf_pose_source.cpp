@@ -131,6 +131,11 @@ bool TfPoseSource::add(const nav_msgs::Odometry& message) {
   return true;
 }
 
+bool TfPoseSource::isOdometry(const geometry_msgs::TransformStamped& message) {
+  return findMovingEdges() && std::find(moving_.begin(), moving_.end(),
+                                        frameName(message.child_frame_id)) != moving_.end();
+}
+
 void TfPoseSource::clear() {
   buffer_->clear();  // static transforms survive
   for (auto& edge : edges_) {

@@ -70,6 +70,10 @@ class TfPoseSource {
   /// The pose of `child_frame_id` (empty: the vehicle) in `header.frame_id`, for source `topic`.
   /// False if unusable.
   bool add(const nav_msgs::Odometry& message);
+  /// Whether a transform is one of the moving edges between the fixed frame and the vehicle.
+  bool isOdometry(const geometry_msgs::TransformStamped& message);
+  /// Counts a reading that was not added.
+  void countRejected() { ++counters_.rejected; }
   /// Forgets what moves, keeps static transforms and counters (a clock jump).
   void clear();
 

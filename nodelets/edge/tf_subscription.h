@@ -5,6 +5,7 @@
 #include <ros/ros.h>
 #include <tf2_msgs/TFMessage.h>
 
+#include <functional>
 #include <string>
 
 #include "edge/conversions.h"
@@ -15,8 +16,9 @@
 namespace semantic_lidar_fusion {
 
 /// Feeds a TfPoseSource from /tf, /tf_static and, where the rig says so, an odometry topic.
-/// A jump of its own stamps makes it forget what moves: transforms of a bag's new pass may come
-/// before the first message of any other sensor, and must outlive the jump that that one shows.
+/// A jump of the odometry's own stamps makes it forget what moves: transforms of a bag's new pass
+/// may come before the first message of any other sensor, and must outlive the jump that that one
+/// shows. Only frames between the fixed frame and the vehicle can show one.
 /// Callbacks run on the queue of the node handle: use the source from that queue only.
 class TfSubscription {
  public:
@@ -43,7 +45,7 @@ class TfSubscription {
           rig.odometry.topic, kQueue,
           boost::function<void(const nav_msgs::OdometryConstPtr&)>(
               [this](const nav_msgs::OdometryConstPtr& message) {
-                if (current(message->child_frame_id, message->header.stamp)) source_.add(*message);
+                observe(message->header.stamp, [this, message] { source_.add(*message); });
               }),
           ros::VoidConstPtr(), hints);
     }
@@ -54,22 +56,29 @@ class TfSubscription {
  private:
   void add(const tf2_msgs::TFMessage& message, bool is_static) {
     for (const auto& transform : message.transforms) {
-      if (is_static || current(transform.child_frame_id, transform.header.stamp)) {
+      if (is_static || !source_.isOdometry(transform)) {
         source_.add(transform, is_static);
+      } else {
+        observe(transform.header.stamp, [this, transform] { source_.add(transform, false); });
       }
     }
   }
 
-  /// False for what is from before a jump.
-  bool current(const std::string& child_frame, const ros::Time& stamp) {
-    if (stamp.isZero()) return true;  // the source counts it
-    const StampVerdict verdict = epoch_.observe(child_frame, stampNs(stamp));
-    if (verdict == StampVerdict::kNewEpoch) source_.clear();
-    return verdict != StampVerdict::kStale;
+  /// Adds a reading of the odometry, at once or when its epoch is clear.
+  void observe(const ros::Time& stamp, const std::function<void()>& add) {
+    if (stamp.isZero()) {
+      add();  // the source counts it
+    } else {
+      epochs_.observe("odometry", stampNs(stamp), add);
+    }
   }
 
   TfPoseSource source_;
-  EpochMonitor epoch_;
+  /// Edges of one chain may overtake each other, and readings that are further off are two
+  /// publishers' or jumps.
+  EpochMonitor epochs_{{"odometry", 2, kNsPerSecond},
+                       [this](StampNs) { source_.clear(); },
+                       [this](const DiscardedMessage&) { source_.countRejected(); }};
   ros::Subscriber static_, moving_, odometry_;
 };
 

@@ -550,7 +550,6 @@ SelectorConfig Rig::selectorConfig() const {
   // image within reach of t_ref, to either side.
   config.image_history_ns =
       std::max(config.image_history_ns, wait_ns + 4 * reach_ns + kNsPerSecond);
-  config.max_pending_scans = scansThatWait(wait_ns);
   return config;
 }
 
@@ -562,12 +561,6 @@ CompensationConfig Rig::compensationConfig() const {
   config.on_missing = odometry.on_missing;
   config.max_extrapolation_ns = toNs(odometry.max_extrapolation_s);
   return config;
-}
-
-std::size_t scansThatWait(StampNs longest_ns) {
-  constexpr StampNs kLeast = 4, kMost = 64, kPeriodNs = kNsPerSecond / 20;
-  const StampNs meanwhile = (longest_ns + kPeriodNs - 1) / kPeriodNs + 1;
-  return static_cast<std::size_t>(std::min(kMost, std::max(kLeast, meanwhile)));
 }
 
 Rig rigFromYaml(const YAML::Node& root, const std::string& base_directory,

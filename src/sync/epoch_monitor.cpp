@@ -2,43 +2,140 @@
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
 #include <algorithm>
+#include <utility>
 
 namespace semantic_lidar_fusion {
 
-constexpr StampNs EpochMonitor::kBackwardNs;
 constexpr StampNs EpochMonitor::kForwardNs;
+constexpr StampNs EpochMonitor::kBackwardNs;
+constexpr std::size_t EpochMonitor::kMaxHeld;
+constexpr int EpochMonitor::kLeadsToSettle;
 
-StampVerdict EpochMonitor::observe(const std::string& source_name, StampNs stamp) {
-  Source& source = sources_[source_name];
-  const bool seen_in_epoch = source.epoch == epoch_ && epoch_ > 0;
-  const auto accept = [&](StampVerdict verdict) {
-    newest_ = verdict == StampVerdict::kNewEpoch ? stamp : std::max(newest_, stamp);
-    source.newest =
-        seen_in_epoch && verdict == StampVerdict::kCurrent ? std::max(source.newest, stamp) : stamp;
-    source.epoch = epoch_;
-    return verdict;
+EpochMonitor::EpochMonitor(EpochConfig config, std::function<void(StampNs)> started_anew,
+                           std::function<void(const DiscardedMessage&)> discarded)
+    : config_(std::move(config)),
+      started_anew_(std::move(started_anew)),
+      discarded_(std::move(discarded)) {}
+
+void EpochMonitor::observe(const std::string& source, StampNs stamp, Work work) {
+  if (source == config_.lead) {
+    observeLead(stamp, std::move(work));
+    return;
+  }
+  const Doubt doubtful = doubt(sources_[source], stamp);
+  if (doubtful == Doubt::kNone) {
+    use(source, stamp, work);
+  } else {
+    hold({source, stamp, doubtful, 0, std::move(work)});
+  }
+}
+
+void EpochMonitor::observeLead(StampNs stamp, Work work) {
+  const auto follows = [&](StampNs newest) {
+    return stamp >= newest - config_.lead_disorder_ns && stamp <= newest + kForwardNs;
   };
-  if (epoch_ == 0) {
-    epoch_ = 1;
-    newest_ = newest_before_ = stamp;
-    return accept(StampVerdict::kCurrent);
+  const auto is_lead = [&](const Held& held) { return held.source == config_.lead; };
+  if (!lead_newest_ || follows(*lead_newest_)) {
+    for (const Held& wrong : take(is_lead)) discard(wrong);
+    use(config_.lead, stamp, work);
+    goOn();
+    return;
   }
-  if (stamp < newest_ - kBackwardNs) {
-    // A source that has always lagged does not jump; one that goes back behind itself does.
-    const bool went_back = seen_in_epoch && stamp < source.newest - kBackwardNs;
-    if (!went_back) return accept(StampVerdict::kCurrent);
-    newest_before_ = newest_;
-    ++epoch_;
-    return accept(StampVerdict::kNewEpoch);
+  const auto previous = std::find_if(held_.rbegin(), held_.rend(), is_lead);
+  if (previous != held_.rend() && !follows(previous->stamp)) {
+    for (const Held& wrong : take(is_lead)) discard(wrong);
   }
-  if (stamp > newest_ + kForwardNs) {
-    const bool straggler = epoch_ > 1 && !seen_in_epoch && stamp <= newest_before_ + kBackwardNs;
-    if (straggler) return StampVerdict::kStale;
-    newest_before_ = newest_;
-    ++epoch_;
-    return accept(StampVerdict::kNewEpoch);
+  hold({config_.lead, stamp, Doubt::kElsewhere, 0, std::move(work)});
+  if (std::count_if(held_.begin(), held_.end(), is_lead) >= config_.confirmations) startAnew();
+}
+
+EpochMonitor::Doubt EpochMonitor::doubt(const Source& source, StampNs stamp) const {
+  if (!lead_newest_) return Doubt::kNone;
+  if (stamp > *lead_newest_ + kForwardNs || stamp < *lead_newest_ - kForwardNs) {
+    return Doubt::kElsewhere;
   }
-  return accept(StampVerdict::kCurrent);
+  if (source.newest) {
+    return stamp < *source.newest - kBackwardNs ? Doubt::kWentBack : Doubt::kNone;
+  }
+  const bool goes_on = source.before && stamp > *source.before;
+  return goes_on && stamp > *lead_newest_ + kBackwardNs ? Doubt::kElsewhere : Doubt::kNone;
+}
+
+void EpochMonitor::hold(Held message) {
+  const std::string source = message.source;
+  const auto is_same = [&](const Held& held) { return held.source == source; };
+  held_.push_back(std::move(message));
+  if (static_cast<std::size_t>(std::count_if(held_.begin(), held_.end(), is_same)) <= kMaxHeld) {
+    return;
+  }
+  const auto oldest = std::find_if(held_.begin(), held_.end(), is_same);
+  const Held wrong = std::move(*oldest);
+  held_.erase(oldest);
+  discard(wrong);
+}
+
+void EpochMonitor::use(const std::string& source, StampNs stamp, const Work& work) {
+  std::optional<StampNs>& newest = sources_[source].newest;
+  newest = newest ? std::max(*newest, stamp) : stamp;
+  if (source == config_.lead) lead_newest_ = newest;
+  work();
+}
+
+/// The source goes on from here: its clock may have been set back for good.
+void EpochMonitor::useLate(const Held& message) {
+  sources_[message.source].newest = message.stamp;
+  message.work();
+}
+
+void EpochMonitor::discard(const Held& message) {
+  const StampNs lead = lead_newest_.value_or(message.stamp);
+  discarded_({message.source, message.stamp, message.stamp - lead});
+}
+
+std::vector<EpochMonitor::Held> EpochMonitor::take(
+    const std::function<bool(const Held&)>& is_meant) {
+  std::vector<Held> taken;
+  std::deque<Held> kept;
+  for (Held& held : held_) {
+    if (is_meant(held)) {
+      taken.push_back(std::move(held));
+    } else {
+      kept.push_back(std::move(held));
+    }
+  }
+  held_ = std::move(kept);
+  return taken;
+}
+
+void EpochMonitor::goOn() {
+  for (Held& held : held_) ++held.leads;
+  for (const Held& held : take([](const Held& h) { return h.leads >= kLeadsToSettle; })) {
+    if (held.doubt == Doubt::kWentBack) {
+      useLate(held);
+    } else {
+      discard(held);
+    }
+  }
+}
+
+void EpochMonitor::startAnew() {
+  const std::vector<Held> messages = take([](const Held&) { return true; });
+  const auto first = std::find_if(messages.begin(), messages.end(),
+                                  [&](const Held& held) { return held.source == config_.lead; });
+  const bool went_back = lead_newest_ && first->stamp < *lead_newest_;
+  for (auto& [name, source] : sources_) {
+    source.before = went_back ? source.newest : std::nullopt;
+    source.newest.reset();
+  }
+  started_anew_(first->stamp);
+  lead_newest_ = first->stamp;
+  for (const Held& held : messages) {
+    if (held.source != config_.lead && doubt(sources_[held.source], held.stamp) != Doubt::kNone) {
+      discard(held);
+    } else {
+      use(held.source, held.stamp, held.work);
+    }
+  }
 }
 
 }  // namespace semantic_lidar_fusion

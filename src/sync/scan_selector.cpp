@@ -13,7 +13,7 @@ namespace {
 
 /// Bounds of memory where stamps are absurdly dense; 30 Hz for five minutes are 9000 images.
 constexpr std::size_t kMaxImages = 16384;
-constexpr std::size_t kMaxScans = 64;
+constexpr std::size_t kLeastKnownScans = 64;
 constexpr std::size_t kMaxSettled = 8;
 
 StampNs distance(StampNs a, StampNs b) { return a < b ? b - a : a - b; }
@@ -52,9 +52,18 @@ void checkNotNegative(const std::string& name, StampNs value, std::vector<std::s
   }
 }
 
+StampNs longestWait(const SelectorConfig& config) {
+  StampNs longest_ns = config.reference_timeout_ns;
+  for (const SelectorCamera& camera : config.cameras) {
+    longest_ns = std::max(longest_ns, camera.timeout_ns);
+  }
+  return longest_ns;
+}
+
 }  // namespace
 
-ScanSelector::ScanSelector(SelectorConfig config) : config_(std::move(config)) {
+ScanSelector::ScanSelector(SelectorConfig config)
+    : config_(std::move(config)), room_(longestWait(config_)) {
   std::vector<std::string> problems;
   const int camera_count = static_cast<int>(config_.cameras.size());
   if (camera_count > 0 &&
@@ -76,9 +85,9 @@ ScanSelector::ScanSelector(SelectorConfig config) : config_(std::move(config)) {
   if (config_.max_pending_scans == 0) {
     problems.push_back("max_pending_scans = 0: must be at least 1");
   }
-  if (config_.image_history_ns < kBackwardJumpNs) {
+  if (config_.image_history_ns < kLeastHistoryNs) {
     problems.push_back("image_history_ns = " + std::to_string(config_.image_history_ns) +
-                       ": must be at least " + std::to_string(kBackwardJumpNs));
+                       ": must be at least " + std::to_string(kLeastHistoryNs));
   }
   if (!problems.empty()) throw ConfigError(std::move(problems));
   cameras_.resize(config_.cameras.size());
@@ -105,14 +114,22 @@ void ScanSelector::addScan(const SelectorScan& scan, StampNs now_ns) {
     }
   }
 
-  startEpochIfJumped(interval.first_ns,
-                     scans_.empty() ? std::nullopt : std::optional<StampNs>(*scans_.rbegin()));
-  if (!scans_.insert(interval.first_ns).second) {
+  if (scans_.count(interval.first_ns) > 0) {
     ++counters_.scans_duplicate;
     return;
   }
-  if (scans_.size() > kMaxScans) scans_.erase(scans_.begin());
   ++counters_.scans;
+  room_.observe(interval.first_ns);
+  if (forgotten_ns_ && interval.first_ns <= *forgotten_ns_) {
+    decisions_.dropped.push_back({interval.first_ns, DropReason::kTooOld});
+    ++counters_.scans_dropped_old;
+    return;
+  }
+  scans_.insert(interval.first_ns);
+  while (scans_.size() > std::max(kLeastKnownScans, 2 * room_.capacity())) {
+    forgotten_ns_ = *scans_.begin();
+    scans_.erase(scans_.begin());
+  }
 
   PendingScan pending;
   pending.scan = scan;
@@ -136,8 +153,6 @@ void ScanSelector::addImage(int camera, StampNs stamp) {
   std::set<StampNs>& images = state.images;
   const StampNs time_ns = stamp + config_.cameras[static_cast<std::size_t>(camera)].time_offset_ns;
 
-  startEpochIfJumped(time_ns,
-                     images.empty() ? std::nullopt : std::optional<StampNs>(*images.rbegin()));
   if (!images.insert(time_ns).second) {
     ++counters_.images_duplicate;
     return;
@@ -150,9 +165,15 @@ void ScanSelector::addImage(int camera, StampNs stamp) {
     settled.difference_ns = std::min(settled.difference_ns, difference_ns);
   }
   if (late) ++counters_.images_late;
-  while (*images.begin() < *images.rbegin() - config_.image_history_ns ||
-         images.size() > kMaxImages) {
-    images.erase(images.begin());
+  forgetOldImages(&images);
+}
+
+void ScanSelector::forgetOldImages(std::set<StampNs>* images) const {
+  // One wild stamp ahead of the scans must not take the place of all others.
+  StampNs newest_ns = *images->rbegin();
+  if (!scans_.empty()) newest_ns = std::min(newest_ns, *scans_.rbegin());
+  while (images->size() > kMaxImages || *images->begin() < newest_ns - config_.image_history_ns) {
+    images->erase(images->begin());
   }
 }
 
@@ -166,33 +187,20 @@ SelectorDecisions ScanSelector::finish() {
   return takeDecisions();
 }
 
-void ScanSelector::reset() { forget(); }
-
-void ScanSelector::startEpochIfJumped(StampNs stamp_ns,
-                                      std::optional<StampNs> newest_of_stream_ns) {
-  const bool backward = newest_of_stream_ns && stamp_ns < *newest_of_stream_ns - kBackwardJumpNs;
-  const bool forward = newest_ns_ && stamp_ns > *newest_ns_ + kForwardJumpNs;
-  if (backward || forward) {
-    if (forward) settleAll(0, Waiting::kNoLonger);
-    forget();
-    ++counters_.epochs;
-  }
-  newest_ns_ = newest_ns_ ? std::max(*newest_ns_, stamp_ns) : stamp_ns;
-}
-
-void ScanSelector::forget() {
+void ScanSelector::reset() {
   for (const PendingScan& pending : pending_) {
     decisions_.dropped.push_back({pending.scan.interval.first_ns, DropReason::kNewEpoch});
   }
   counters_.scans_dropped_epoch += pending_.size();
   pending_.clear();
   scans_.clear();
-  newest_ns_.reset();
+  forgotten_ns_.reset();
   for (CameraState& state : cameras_) state = CameraState();
 }
 
 void ScanSelector::makeRoom() {
-  while (pending_.size() > config_.max_pending_scans) {
+  const std::size_t most = std::max(config_.max_pending_scans, room_.capacity());
+  while (pending_.size() > most) {
     PendingScan& oldest = pending_.front();
     if (oldest.reference_ns) {
       // Others work on this scan already: it must not stay without an answer.

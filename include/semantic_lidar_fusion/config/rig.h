@@ -127,10 +127,6 @@ struct Rig {
   CompensationConfig compensationConfig() const;
 };
 
-/// How many scans may wait at a stage whose longest wait is this: those that come meanwhile at
-/// 20 Hz, 4 to 64. What is late drops none of them; more wait only where a stage is overloaded.
-std::size_t scansThatWait(StampNs longest_ns);
-
 /// Loads and checks. `overrides`: "key=value", keys with dots ("occlusion.mode=paper"), cameras by
 /// name ("cameras.A0.max_theta_deg=50"), other list elements by position, values in YAML, no value
 /// for an empty text; applied in order before checking. Throws ConfigError with every problem.

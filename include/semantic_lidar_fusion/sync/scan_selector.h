@@ -15,11 +15,8 @@
 /// `reorder_window_ns` out of it. An image that comes too late to be chosen changes nothing and is
 /// counted.
 ///
-/// Epochs. A stamp more than kBackwardJumpNs before the newest of its own stream (a camera, the
-/// scans) is a bag that starts anew: scans and images are forgotten. A stamp more than
-/// kForwardJumpNs after the newest of all streams ends the past: pending scans are settled with
-/// what is known, then all is forgotten. Jumps of a clock, and bags shorter than kBackwardJumpNs,
-/// are the caller's to see and to `reset`.
+/// Epochs. Jumps of time are the caller's to see (EpochMonitor) and to `reset`. Stamps that jump
+/// without it cost their own camera its images, and nothing else.
 #pragma once
 
 #include <cstdint>
@@ -31,6 +28,7 @@
 
 #include "semantic_lidar_fusion/common/point_cloud.h"
 #include "semantic_lidar_fusion/common/types.h"
+#include "semantic_lidar_fusion/sync/waiting_room.h"
 
 namespace semantic_lidar_fusion {
 
@@ -52,8 +50,10 @@ struct SelectorConfig {
   int reference_camera = 0;  ///< index into `cameras`
   StampNs reference_timeout_ns = 200000000;
   ImageChoice image_choice = ImageChoice::kClosestToReference;
-  std::size_t max_pending_scans = 4;  ///< the oldest is dropped and counted
-  /// Stamps older than their camera's newest by more are forgotten; at least kBackwardJumpNs.
+  /// More scans may wait where they come faster (WaitingRoom); the oldest is dropped and counted.
+  std::size_t max_pending_scans = 4;
+  /// Images older than the newest scan, or than their camera's newest image if that is older, by
+  /// more are forgotten; at least kLeastHistoryNs.
   StampNs image_history_ns = 2000000000;
 };
 
@@ -81,8 +81,9 @@ struct SelectionDecision {
 };
 
 enum class DropReason : std::uint8_t {
-  kQueueFull,  ///< more than max_pending_scans waited for t_ref
-  kNewEpoch,   ///< stamps or clock went back
+  kQueueFull,  ///< too many waited for t_ref
+  kNewEpoch,   ///< `reset`
+  kTooOld,     ///< as old as scans that are no longer remembered: it may be a duplicate
 };
 
 /// A scan that gets no further decision.
@@ -101,20 +102,19 @@ struct SelectorCounters {
   std::uint64_t scans = 0;
   std::uint64_t scans_dropped_pending = 0;  ///< DropReason::kQueueFull
   std::uint64_t scans_dropped_epoch = 0;    ///< DropReason::kNewEpoch
+  std::uint64_t scans_dropped_old = 0;      ///< DropReason::kTooOld
   std::uint64_t scans_duplicate = 0;        ///< a scan with this first stamp is known
   std::uint64_t reference_timeouts = 0;
   std::uint64_t images = 0;
   std::uint64_t images_duplicate = 0;
   std::uint64_t images_late = 0;  ///< would have been chosen, had they come before the decision
-  std::uint64_t epochs = 0;       ///< resets by a backward or large forward jump
   std::vector<std::uint64_t> camera_timeouts;  ///< per camera
   std::vector<std::uint64_t> camera_none;      ///< per camera: no image within the limit
 };
 
 class ScanSelector {
  public:
-  static constexpr StampNs kBackwardJumpNs = kNsPerSecond;
-  static constexpr StampNs kForwardJumpNs = 5 * kNsPerSecond;
+  static constexpr StampNs kLeastHistoryNs = kNsPerSecond;
   /// Largest magnitude of a stamp; ROS stamps reach 4.3e18.
   static constexpr StampNs kMaxStampNs = StampNs{1} << 62;
 
@@ -159,9 +159,8 @@ class ScanSelector {
   };
   enum class Waiting : std::uint8_t { kAsConfigured, kNoLonger };
 
-  void startEpochIfJumped(StampNs stamp_ns, std::optional<StampNs> newest_of_stream_ns);
-  void forget();
   void makeRoom();
+  void forgetOldImages(std::set<StampNs>* images) const;
   /// Settles what it can of the scan; true if nothing is left.
   bool settleScan(PendingScan* pending, StampNs now_ns, Waiting waiting);
   void settleReference(PendingScan* pending, StampNs waited_ns, Waiting waiting);
@@ -172,10 +171,11 @@ class ScanSelector {
 
   SelectorConfig config_;
   std::vector<CameraState> cameras_;
-  std::deque<PendingScan> pending_;   ///< oldest first
-  std::set<StampNs> scans_;           ///< first stamps of the last scans
-  std::optional<StampNs> newest_ns_;  ///< of all streams
-  SelectorDecisions decisions_;       ///< made and not yet returned
+  std::deque<PendingScan> pending_;      ///< oldest first
+  std::set<StampNs> scans_;              ///< first stamps of the last scans
+  std::optional<StampNs> forgotten_ns_;  ///< the newest that is no longer among them
+  WaitingRoom room_;
+  SelectorDecisions decisions_;  ///< made and not yet returned
   SelectorCounters counters_;
 };
 

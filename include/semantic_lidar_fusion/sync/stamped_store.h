@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: MIT
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <map>
+#include <utility>
 
 #include "semantic_lidar_fusion/common/types.h"
 
@@ -14,7 +16,10 @@ class StampedStore {
  public:
   explicit StampedStore(std::size_t capacity) : capacity_(capacity) {}
 
-  /// Replaces the value of a known stamp. Returns the number of values that were pushed out.
+  /// A larger capacity; a smaller one changes nothing.
+  void grow(std::size_t capacity) { capacity_ = std::max(capacity_, capacity); }
+  /// Replaces the value of a known stamp. Returns the number of values that were pushed out: of a
+  /// full store the oldest, which is the new value itself if none is older.
   std::size_t put(StampNs stamp, T value) {
     values_[stamp] = std::move(value);
     std::size_t dropped = 0;
@@ -24,7 +29,7 @@ class StampedStore {
     }
     return dropped;
   }
-  /// Null if unknown; valid until the next change.
+  /// Null if unknown, also right after a `put` into a full store; valid until the next change.
   const T* find(StampNs stamp) const {
     const auto found = values_.find(stamp);
     return found == values_.end() ? nullptr : &found->second;

@@ -208,18 +208,8 @@ TEST(RigTest, SelectorConfigHoldsTheTimesInNanoseconds) {
   EXPECT_EQ(config.cameras[1].max_time_difference_ns, 20000000);
   EXPECT_EQ(config.cameras[1].time_offset_ns, -10000000);
   EXPECT_GT(config.image_history_ns, 30020000000);
-  EXPECT_EQ(config.max_pending_scans, 64u);
   EXPECT_NO_THROW(ScanSelector{config});
   EXPECT_NO_THROW(ScanSelector{parse("").selectorConfig()});
-  EXPECT_EQ(parse("").selectorConfig().max_pending_scans, 5u);
-}
-
-TEST(RigTest, AsManyScansMayWaitAsComeInTheWait) {
-  EXPECT_EQ(scansThatWait(0), 4u);
-  EXPECT_EQ(scansThatWait(150000000), 4u);
-  EXPECT_EQ(scansThatWait(150000001), 5u);
-  EXPECT_EQ(scansThatWait(kNsPerSecond), 21u);
-  EXPECT_EQ(scansThatWait(3600 * kNsPerSecond), 64u);
 }
 
 TEST(RigTest, ClassesMayBeAPathAFileKeyOrInPlace) {
