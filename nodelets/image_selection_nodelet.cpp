@@ -71,10 +71,9 @@ class ImageSelectionNodelet : public FusionNodelet {
   }
 
   void updateSubscriptions() override {
-    bool wanted = reference_.getNumSubscribers() > 0;
+    bool wanted = isWanted(reference_);
     for (const auto& camera : cameras_) {
-      wanted = wanted || camera->selection.getNumSubscribers() > 0 ||
-               camera->image_selected.getNumSubscribers() > 0;
+      wanted = wanted || isWanted(camera->selection) || isWanted(camera->image_selected);
     }
     if (wanted == static_cast<bool>(lidar_subscriber_)) return;
     if (!wanted) {
@@ -297,10 +296,6 @@ class ImageSelectionNodelet : public FusionNodelet {
                 imageMessage(decodedImage(*image->compressed), image->compressed->header));
       }
     });
-  }
-
-  std::string explainSilence() override {
-    return lidar_subscriber_ ? "" : "nobody listens to " + reference_.getTopic();
   }
 
   std::unique_ptr<ScanSelector> selector_;

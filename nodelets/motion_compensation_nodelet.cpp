@@ -65,7 +65,7 @@ class MotionCompensationNodelet : public FusionNodelet {
   }
 
   void updateSubscriptions() override {
-    const bool wanted = output_.getNumSubscribers() > 0;
+    const bool wanted = isWanted(output_);
     if (wanted && !references_subscriber_) {
       references_subscriber_ = subscribe<sensor_msgs::TimeReference>(
           getNodeHandle(), "scan_reference", 16, &MotionCompensationNodelet::onReference);
@@ -221,10 +221,6 @@ class MotionCompensationNodelet : public FusionNodelet {
     health().count("points without odometry: pose held", counters.held_points);
     health().count("points without odometry: pose extrapolated", counters.extrapolated_points);
     publish(output_, compensatedCloudMessage(compensated.cloud));
-  }
-
-  std::string explainSilence() override {
-    return output_.getNumSubscribers() == 0 ? "nobody listens to " + output_.getTopic() : "";
   }
 
   std::unique_ptr<ScanPipeline> pipeline_;

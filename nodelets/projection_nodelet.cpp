@@ -87,8 +87,8 @@ class ProjectionNodelet : public FusionNodelet {
   }
 
   void updateSubscriptions() override {
-    bool wanted = output_.getNumSubscribers() > 0;
-    for (const auto& camera : cameras_) wanted = wanted || camera->overlay.getNumSubscribers() > 0;
+    bool wanted = isWanted(output_);
+    for (const auto& camera : cameras_) wanted = wanted || isWanted(camera->overlay);
     for (const auto& camera : cameras_) updateCamera(wanted, camera.get());
     if (wanted && !cloud_subscriber_) {
       reference_subscriber_ = subscribe<sensor_msgs::TimeReference>(
@@ -135,7 +135,7 @@ class ProjectionNodelet : public FusionNodelet {
            config.input == CameraInput::kLabels ? cameraTopic(config, "probabilities")
                                                 : semanticsTopic(rig(), config),
            &camera->probabilities, &ProjectionNodelet::onProbabilities);
-    images(wanted && camera->overlay.getNumSubscribers() > 0, cameraTopic(config, "image_selected"),
+    images(wanted && isWanted(camera->overlay), cameraTopic(config, "image_selected"),
            &camera->image, &ProjectionNodelet::onImage);
   }
 
@@ -343,10 +343,6 @@ class ProjectionNodelet : public FusionNodelet {
                                  toSeconds(pipeline_->imageTime(index, stamp) - scan.cloud->stamp)),
                   (*image)->header));
     }
-  }
-
-  std::string explainSilence() override {
-    return cloud_subscriber_ ? "" : "nobody listens to " + output_.getTopic();
   }
 
   std::unique_ptr<ScanPipeline> pipeline_;

@@ -53,7 +53,7 @@ class SegmentationNodelet : public FusionNodelet {
   void updateSubscriptions() override {
     for (std::size_t i = 0; i < cameras_.size(); ++i) {
       Camera& camera = cameras_[i];
-      const bool wanted = camera.scores.getNumSubscribers() > 0;
+      const bool wanted = isWanted(camera.scores);
       if (wanted && !camera.subscriber) {
         camera.subscriber = subscribe<sensor_msgs::Image>(
             getNodeHandle(), cameraTopic(rig().cameras[i], "image_selected"), 16,

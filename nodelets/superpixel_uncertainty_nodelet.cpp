@@ -92,8 +92,8 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     for (const auto& owned : cameras_) {
       Camera* camera = owned.get();
       const bool wants_semantics =
-          listened(camera->share) || listened(camera->probabilities) || listened(camera->overlay);
-      const bool wants_image = wants_semantics || listened(camera->superpixels);
+          isWanted(camera->share) || isWanted(camera->probabilities) || isWanted(camera->overlay);
+      const bool wants_image = wants_semantics || isWanted(camera->superpixels);
       update(wants_image, cameraTopic(camera->config, "image_selected"), camera,
              &SuperpixelUncertaintyNodelet::onImage, &camera->image_subscriber);
       update(wants_image && camera->config.input != CameraInput::kProbabilities,

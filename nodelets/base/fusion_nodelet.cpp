@@ -2,7 +2,6 @@
 #include "base/fusion_nodelet.h"
 
 #include <nodelet/detail/callback_queue.h>
-#include <ros/master.h>
 #include <std_msgs/String.h>
 
 #include <algorithm>
@@ -22,6 +21,10 @@ constexpr std::chrono::seconds kReportPeriod{30};
 constexpr std::chrono::seconds kJumpReportPeriod{1};
 /// Silence after which the watchdog speaks.
 constexpr std::chrono::seconds kSilence{5};
+/// How long a nodelet works on after its last listener has left.
+constexpr std::chrono::milliseconds kLinger{2000};
+/// How long an answer of the master is waited for.
+constexpr std::chrono::milliseconds kMasterPatience{1000};
 constexpr auto kEver = std::chrono::duration<double>::max();
 /// A clock that stands still for longer is taken for the end of a bag.
 constexpr StampNs kClockStall = 3 * kNsPerSecond;
@@ -102,10 +105,7 @@ void FusionNodelet::onInit() {
                                                                  getPrivateNodeHandle(), getName());
     diagnostics_->setHardwareID(rig_.name.empty() ? "none" : rig_.name);
     diagnostics_->add("fusion", [this](diagnostic_updater::DiagnosticStatusWrapper& status) {
-      health_.fill(status);
-      if (clockIsSilent()) {
-        status.mergeSummary(diagnostic_msgs::DiagnosticStatus::STALE, kSilentClock);
-      }
+      fillDiagnostics(status);
     });
     {
       // Listeners may connect while publishers are still being set up.
@@ -168,6 +168,53 @@ void FusionNodelet::guard(const std::string& where, const std::function<void()>&
   } catch (...) {
     health_.count("dropped: error in " + where);
     error(where, where + ": unknown exception");
+  }
+}
+
+bool FusionNodelet::isWanted(const ros::Publisher& publisher) const {
+  if (!publisher) return false;
+  if (publisher.getNumSubscribers() > 0) return true;
+  std::lock_guard<std::mutex> lock(demand_mutex_);
+  const auto left = farewell_.find(publisher.getTopic());
+  return left != farewell_.end() && Health::Clock::now() - left->second < kLinger;
+}
+
+void FusionNodelet::demandChanged(const std::string& topic, bool has_left) {
+  if (has_left) {
+    std::lock_guard<std::mutex> lock(demand_mutex_);
+    farewell_[topic] = Health::Clock::now();
+  }
+  const auto update = [this, gate = gate_] {
+    gate->pass([this] {
+      guard("connection", [this] {
+        std::lock_guard<std::mutex> lock(connect_mutex_);
+        if (initialized_) updateSubscriptions();
+      });
+    });
+  };
+  master_->run(update, has_left ? kLinger : std::chrono::milliseconds::zero());
+}
+
+std::string FusionNodelet::idleReason() const {
+  std::vector<ros::Publisher> advertised;
+  {
+    std::lock_guard<std::mutex> lock(demand_mutex_);
+    advertised = advertised_;
+  }
+  for (const ros::Publisher& publisher : advertised) {
+    if (isWanted(publisher)) return {};
+  }
+  return advertised.empty() ? "" : "nobody listens to " + advertised.front().getTopic();
+}
+
+void FusionNodelet::fillDiagnostics(diagnostic_updater::DiagnosticStatusWrapper& status) {
+  health_.fill(status);
+  const std::string idle = idleReason();
+  if (status.level == diagnostic_msgs::DiagnosticStatus::OK && !idle.empty()) {
+    status.summary(diagnostic_msgs::DiagnosticStatus::OK, "idle: " + idle);
+  }
+  if (clockIsSilent()) {
+    status.mergeSummary(diagnostic_msgs::DiagnosticStatus::STALE, kSilentClock);
   }
 }
 
@@ -234,7 +281,7 @@ void FusionNodelet::watch() {
     warn("clock", kSilentClock);
     return;
   }
-  const std::string idle = explainSilence();
+  const std::string idle = idleReason();
   if (is_silent && !is_halted && !idle.empty()) {
     warn("idle", "nothing published for 5 s: " + idle);
     return;
@@ -242,15 +289,31 @@ void FusionNodelet::watch() {
   // A bag that is paused or has ended is no news; what it never held is.
   const std::vector<std::string> silent =
       health_.silentInputs(is_halted ? kEver : std::chrono::duration<double>(kSilence));
-  if (silent.empty()) return;
-  ros::master::V_TopicInfo topics;
-  ros::master::getTopics(topics);
+  if (silent.empty() || is_asking_.exchange(true)) return;
+  master_->run([this, gate = gate_, silent, is_silent, is_halted] {
+    gate->pass([&] {
+      guard("watchdog", [&] { tellSilence(silent, is_silent, is_halted); });
+      is_asking_ = false;
+    });
+  });
+}
+
+void FusionNodelet::tellSilence(const std::vector<std::string>& silent, bool is_silent,
+                                bool is_halted) {
+  const std::optional<ros::master::V_TopicInfo> topics = advertisedTopics(kMasterPatience);
+  if (!topics) {
+    health_.problem("the ROS master does not answer");
+    warn("master", "the ROS master at " + ros::master::getURI() +
+                       " does not answer: connections that exist go on, new ones cannot be made; "
+                       "start it and this node again");
+    return;
+  }
   std::string reasons;
   for (const auto& topic : silent) {
     // While something is published, only what nobody advertises is worth a line: a camera that is
     // merely late is counted where it is missed.
-    if ((!is_silent || is_halted) && isAdvertised(topic, topics)) continue;
-    reasons += (reasons.empty() ? "" : "; ") + describeSilentTopic(topic, topics);
+    if ((!is_silent || is_halted) && isAdvertised(topic, *topics)) continue;
+    reasons += (reasons.empty() ? "" : "; ") + describeSilentTopic(topic, *topics);
   }
   if (reasons.empty()) return;
   warn("silence " + reasons, std::string(is_silent ? "nothing published for 5 s: " : "") + reasons);

@@ -4,14 +4,15 @@
 /// nothing is published.
 ///
 /// Threads: callbacks given to `subscribe` with getNodeHandle() run one at a time; timers of this
-/// class run on the multi-threaded queue, hold no lock while they ask the master, and touch only
-/// Health, which locks for itself.
+/// class run on the multi-threaded queue and touch only Health, which locks for itself. Whatever
+/// asks the master runs on the MasterThread.
 #pragma once
 
 #include <diagnostic_updater/diagnostic_updater.h>
 #include <nodelet/nodelet.h>
 #include <ros/ros.h>
 
+#include <atomic>
 #include <chrono>
 #include <condition_variable>
 #include <exception>
@@ -21,9 +22,11 @@
 #include <mutex>
 #include <string>
 #include <utility>
+#include <vector>
 
 #include "base/health.h"
 #include "base/inbox.h"
+#include "base/master_thread.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
@@ -67,11 +70,9 @@ class FusionNodelet : public nodelet::Nodelet {
   /// Sets up publishers, then subscribers; runs inside the boundary. A ConfigError ends the
   /// nodelet's life: it is reported once and nothing is subscribed.
   virtual void initialize() = 0;
-  /// Demand has changed: subscribe on the first listener, shut down on the last. Called with
-  /// `connectMutex` held.
+  /// Demand has changed (see isWanted): subscribe on the first listener, shut down after the last.
+  /// Called with `connectMutex` held, on the MasterThread once `initialize` is over.
   virtual void updateSubscriptions() {}
-  /// Why nothing has to be published (nobody listens), in words; empty = something should be.
-  virtual std::string explainSilence() { return {}; }
   /// Called every `kTickPeriod` with now(), one at a time with the callbacks of getNodeHandle().
   virtual void tick(StampNs /*now_ns*/) {}
   /// Ends all callbacks and waits for those that run. Every destructor of a derived class calls it
@@ -115,7 +116,11 @@ class FusionNodelet : public nodelet::Nodelet {
         [this, gate = gate_, resolved, callback](const Pointer& message) {
           gate->pass([&] { guard(resolved, [&] { callback(message); }); });
         },
-        [this, resolved] { reportOverflow(resolved); });
+        [this, resolved] { reportOverflow(resolved); },
+        [this, gate = gate_, resolved](std::size_t messages) {
+          gate->pass(
+              [&] { health_.count("dropped: no longer subscribed, " + resolved, messages); });
+        });
     const boost::function<void(const Pointer&)> store = [this, gate = gate_, resolved,
                                                          inbox](const Pointer& message) {
       gate->pass([&] {
@@ -138,17 +143,22 @@ class FusionNodelet : public nodelet::Nodelet {
   /// Advertises a topic whose first listener and last farewell call updateSubscriptions.
   template <class M>
   ros::Publisher advertise(ros::NodeHandle& handle, const std::string& topic, int queue_size) {
-    const ros::SubscriberStatusCallback changed =
-        [this, gate = gate_](const ros::SingleSubscriberPublisher&) {
-          gate->pass([this] {
-            guard("connection", [this] {
-              std::lock_guard<std::mutex> lock(connect_mutex_);
-              if (initialized_) updateSubscriptions();
-            });
-          });
-        };
-    return handle.advertise<M>(topic, static_cast<uint32_t>(queue_size), changed, changed);
+    const auto changed = [this, gate = gate_](bool has_left) {
+      return [this, gate, has_left](const ros::SingleSubscriberPublisher& link) {
+        gate->pass([&] { guard("connection", [&] { demandChanged(link.getTopic(), has_left); }); });
+      };
+    };
+    const ros::Publisher publisher = handle.advertise<M>(
+        topic, static_cast<uint32_t>(queue_size), ros::SubscriberStatusCallback(changed(false)),
+        ros::SubscriberStatusCallback(changed(true)));
+    std::lock_guard<std::mutex> lock(demand_mutex_);
+    advertised_.push_back(publisher);
+    return publisher;
   }
+
+  /// Whether somebody listens, or did until a moment ago: a listener that comes back finds
+  /// everything running.
+  bool isWanted(const ros::Publisher& publisher) const;
 
   /// Publishes by pointer and counts; the message must not be touched afterwards.
   template <class M>
@@ -172,7 +182,13 @@ class FusionNodelet : public nodelet::Nodelet {
  private:
   void onInit() final;
   bool mayReport(const std::string& key, std::chrono::seconds period);
+  void demandChanged(const std::string& topic, bool has_left);
+  /// Why nothing has to be published, in words; empty = something should be.
+  std::string idleReason() const;
+  void fillDiagnostics(diagnostic_updater::DiagnosticStatusWrapper& status);
   void watch();
+  /// Says which topics are missing; asks the master.
+  void tellSilence(const std::vector<std::string>& silent, bool is_silent, bool is_halted);
   /// How far the simulated clock has run, jumps apart, and how long it has stood still, both in ns.
   std::pair<StampNs, StampNs> simulatedClock() const;
   void reportOverflow(const std::string& topic);
@@ -190,6 +206,11 @@ class FusionNodelet : public nodelet::Nodelet {
   std::shared_ptr<CallbackGate> gate_ = std::make_shared<CallbackGate>();
   Rig rig_;
   Health health_;
+  std::shared_ptr<MasterThread> master_ = MasterThread::shared();
+  std::atomic<bool> is_asking_{false};  ///< a question to the master is under way
+  mutable std::mutex demand_mutex_;
+  std::vector<ros::Publisher> advertised_;                     ///< guarded by demand_mutex_
+  std::map<std::string, Health::Clock::time_point> farewell_;  ///< by topic; likewise
   std::mutex connect_mutex_;
   bool initialized_ = false;  ///< guarded by connect_mutex_
   mutable std::mutex clock_mutex_;

@@ -9,19 +9,21 @@ constexpr std::chrono::seconds Health::kErrorHold;
 
 void Health::expectInput(const std::string& topic, Expect expect) {
   std::lock_guard<std::mutex> lock(mutex_);
-  inputs_[topic].expect = expect;
+  Flow& flow = inputs_[topic];
+  flow.expect = expect;
+  if (!flow.is_subscribed) flow.last = Clock::now();  // not missed at once
+  flow.is_subscribed = true;
 }
 
 void Health::retireInput(const std::string& topic) {
   std::lock_guard<std::mutex> lock(mutex_);
-  inputs_.erase(topic);
+  const auto found = inputs_.find(topic);
+  if (found != inputs_.end()) found->second.is_subscribed = false;
 }
 
 void Health::received(const std::string& topic) {
   std::lock_guard<std::mutex> lock(mutex_);
-  const auto found = inputs_.find(topic);
-  if (found == inputs_.end()) return;  // a straggler of a subscription that has ended
-  Flow& flow = found->second;
+  Flow& flow = inputs_[topic];
   ++flow.messages;
   flow.last = Clock::now();
 }
@@ -79,7 +81,7 @@ std::vector<std::string> Health::silentInputs(std::chrono::duration<double> age)
   std::vector<std::string> silent;
   for (const auto& [topic, flow] : inputs_) {
     const bool is_stale = flow.expect == Expect::kStream && Clock::now() - flow.last > age;
-    if (flow.messages == 0 || is_stale) silent.push_back(topic);
+    if (flow.is_subscribed && (flow.messages == 0 || is_stale)) silent.push_back(topic);
   }
   return silent;
 }

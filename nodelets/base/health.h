@@ -25,7 +25,7 @@ class Health {
   };
   /// Declares an input so that it is shown, and missed, before its first message.
   void expectInput(const std::string& topic, Expect expect = Expect::kStream);
-  /// An input that is no longer subscribed: neither shown nor missed.
+  /// An input that is no longer subscribed: not missed; its count stays.
   void retireInput(const std::string& topic);
   void received(const std::string& topic);
   void published(const std::string& topic);
@@ -54,6 +54,7 @@ class Health {
 
   struct Flow {
     Expect expect = Expect::kStream;
+    bool is_subscribed = true;
     std::uint64_t messages = 0;
     std::uint64_t at_last_fill = 0;
     Clock::time_point last{};

@@ -20,19 +20,26 @@ namespace semantic_lidar_fusion {
 /// This one says so: a subscription whose callback does nothing but `add` is never behind, and what
 /// a slow consumer has no time for is dropped here, where it is counted. Messages are handed over
 /// in order and one at a time, also on a queue that several threads serve. Thread-safe; lives as
-/// long as the subscription's callback holds it, and what still waits then is forgotten.
+/// long as the subscription's callback holds it, and what still waits then is lost.
 template <class Message>
 class Inbox : public boost::enable_shared_from_this<Inbox<Message>> {
  public:
   using Handle = std::function<void(const Message&)>;
   /// `handle` runs on `queue`, which must outlive every call of `add`. `overflowed` runs within
-  /// `add`, once for each message that is dropped.
+  /// `add`, once for each message that is dropped; `lost` at the end, with the number of messages
+  /// that still wait, if there are any.
   Inbox(ros::CallbackQueueInterface* queue, std::size_t capacity, Handle handle,
-        std::function<void()> overflowed)
+        std::function<void()> overflowed, std::function<void(std::size_t)> lost)
       : queue_(queue),
         capacity_(capacity),
         handle_(std::move(handle)),
-        overflowed_(std::move(overflowed)) {}
+        overflowed_(std::move(overflowed)),
+        lost_(std::move(lost)) {}
+  ~Inbox() {
+    if (!waiting_.empty()) lost_(waiting_.size());
+  }
+  Inbox(const Inbox&) = delete;
+  Inbox& operator=(const Inbox&) = delete;
 
   void add(const Message& message) {
     bool full = false;
@@ -81,6 +88,7 @@ class Inbox : public boost::enable_shared_from_this<Inbox<Message>> {
   const std::size_t capacity_;
   const Handle handle_;
   const std::function<void()> overflowed_;
+  const std::function<void(std::size_t)> lost_;
   std::mutex handling_;  ///< held while a message is handled
   std::mutex mutex_;     ///< guards what follows
   std::deque<Message> waiting_;

@@ -23,7 +23,9 @@ STAGES = {
         [
             "empty scans",
             "dropped: stamp 0 on points",
-            "dropped: points from before a clock jump",
+            "dropped: points, stamp disagrees with points",
+            "dropped: scan older than all that are remembered",
+            "dropped: no longer subscribed, /points",
             "dropped: error in /points",
             "dropped: queue full, /points",
             "dropped: scan, too many wait for images",
@@ -36,7 +38,9 @@ STAGES = {
         "output /points_compensated messages",
         [
             "dropped: scan of stamp 0",
-            "dropped: lidar from before a clock jump",
+            "dropped: points, stamp disagrees with points",
+            "dropped: scan of a known stamp",
+            "dropped: no longer subscribed, /points",
             "dropped: error in /points",
             "dropped: queue full, /points",
             "dropped: scan, too many wait for odometry or scan_reference",
@@ -48,7 +52,9 @@ STAGES = {
         "input /points_compensated messages",
         "output /points_semantic messages",
         [
-            "dropped: points_compensated from before a clock jump",
+            "dropped: points_compensated, stamp disagrees with scan_reference",
+            "dropped: scan behind the last one, or known",
+            "dropped: no longer subscribed, /points_compensated",
             "dropped: error in /points_compensated",
             "dropped: error in fusion",
             "dropped: queue full, /points_compensated",

@@ -18,7 +18,8 @@ TEST(Inbox, HandsOverInOrderOnTheQueuesTurn) {
   ros::CallbackQueue queue;
   std::vector<int> handled;
   const auto inbox = boost::make_shared<IntInbox>(
-      &queue, 4, [&](int value) { handled.push_back(value); }, [] { FAIL(); });
+      &queue, 4, [&](int value) { handled.push_back(value); }, [] { FAIL(); },
+      [](std::size_t) { FAIL(); });
   for (int i = 0; i < 4; ++i) inbox->add(i);
   EXPECT_TRUE(handled.empty());
   queue.callAvailable();
@@ -30,7 +31,8 @@ TEST(Inbox, WhatOverflowsIsTheOldestAndIsCountedExactly) {
   std::vector<int> handled;
   int dropped = 0;
   const auto inbox = boost::make_shared<IntInbox>(
-      &queue, 3, [&](int value) { handled.push_back(value); }, [&] { ++dropped; });
+      &queue, 3, [&](int value) { handled.push_back(value); }, [&] { ++dropped; },
+      [](std::size_t) { FAIL(); });
   for (int i = 0; i < 10; ++i) inbox->add(i);
   queue.callAvailable();
   EXPECT_EQ(handled, (std::vector<int>{7, 8, 9}));
@@ -53,7 +55,7 @@ TEST(Inbox, OneAtATimeAndNoneLostOnSeveralThreads) {
         handled.push_back(value);
         --inside;
       },
-      [&] { ++dropped; });
+      [&] { ++dropped; }, [](std::size_t) { FAIL(); });
   std::atomic<bool> stop{false};
   std::vector<std::thread> threads;
   for (int t = 0; t < 3; ++t) {
@@ -72,15 +74,18 @@ TEST(Inbox, OneAtATimeAndNoneLostOnSeveralThreads) {
   EXPECT_TRUE(std::is_sorted(handled.begin(), handled.end()));
 }
 
-TEST(Inbox, WhatWaitsWhenTheSubscriptionEndsIsForgotten) {
+TEST(Inbox, WhatWaitsWhenTheSubscriptionEndsIsCounted) {
   ros::CallbackQueue queue;
   int handled = 0;
+  std::size_t lost = 0;
   auto inbox = boost::make_shared<IntInbox>(
-      &queue, 3, [&](int) { ++handled; }, [] {});
+      &queue, 3, [&](int) { ++handled; }, [] {}, [&](std::size_t n) { lost += n; });
   inbox->add(1);
+  inbox->add(2);
   inbox.reset();
   queue.callAvailable();
   EXPECT_EQ(handled, 0);
+  EXPECT_EQ(lost, 2u);
 }
 
 }  // namespace
