@@ -11,6 +11,7 @@
 #include "base/parameters.h"
 #include "edge/version.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/plain_text.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -28,6 +29,11 @@ constexpr std::chrono::milliseconds kMasterPatience{1000};
 constexpr auto kEver = std::chrono::duration<double>::max();
 /// A clock that stands still for longer is taken for the end of a bag.
 constexpr StampNs kClockStall = 3 * kNsPerSecond;
+
+/// Lines hold texts of messages, which may hold anything.
+constexpr std::size_t kLongestLine = 2000;
+
+constexpr std::size_t kMaxReports = 1000;
 
 const char* const kSilentClock = "use_sim_time is true but /clock is silent; play with --clock";
 
@@ -255,6 +261,7 @@ void FusionNodelet::reportOverflow(const std::string& topic) {
 bool FusionNodelet::mayReport(const std::string& key, std::chrono::seconds period) {
   std::lock_guard<std::mutex> lock(report_mutex_);
   const auto now = Health::Clock::now();
+  if (reported_.size() >= kMaxReports) reported_.clear();  // keys hold texts of messages
   const auto [entry, first] = reported_.emplace(key, now);
   if (!first && now - entry->second < period) return false;
   entry->second = now;
@@ -262,12 +269,12 @@ bool FusionNodelet::mayReport(const std::string& key, std::chrono::seconds perio
 }
 
 void FusionNodelet::warn(const std::string& key, const std::string& text) {
-  if (mayReport(key, kReportPeriod)) NODELET_WARN_STREAM(text);
+  if (mayReport(key, kReportPeriod)) NODELET_WARN_STREAM(plainText(text, kLongestLine));
 }
 
 void FusionNodelet::error(const std::string& key, const std::string& text) {
   health_.error(text);
-  if (mayReport(key, kReportPeriod)) NODELET_ERROR_STREAM(text);
+  if (mayReport(key, kReportPeriod)) NODELET_ERROR_STREAM(plainText(text, kLongestLine));
 }
 
 void FusionNodelet::watch() {

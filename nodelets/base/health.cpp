@@ -3,9 +3,18 @@
 
 #include <algorithm>
 
+#include "semantic_lidar_fusion/common/plain_text.h"
+
 namespace semantic_lidar_fusion {
 
 constexpr std::chrono::seconds Health::kErrorHold;
+
+namespace {
+
+/// Texts of messages may hold anything.
+constexpr std::size_t kLongestText = 2000;
+
+}  // namespace
 
 void Health::expectInput(const std::string& topic, Expect expect) {
   std::lock_guard<std::mutex> lock(mutex_);
@@ -61,12 +70,12 @@ void Health::stage(const std::string& name, double milliseconds) {
 
 void Health::set(const std::string& key, const std::string& value) {
   std::lock_guard<std::mutex> lock(mutex_);
-  values_[key] = value;
+  values_[key] = plainText(value, kLongestText);
 }
 
 void Health::error(const std::string& text) {
   std::lock_guard<std::mutex> lock(mutex_);
-  last_error_ = text;
+  last_error_ = plainText(text, kLongestText);
   last_error_time_ = Clock::now();
 }
 

@@ -11,9 +11,11 @@
 #include <utility>
 #include <vector>
 
+#include "opencv_error.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/common/types.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
+#include "semantic_lidar_fusion/segmentation/network_check.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -185,32 +187,6 @@ void checkChannels(const Description& description, int output_channels, Problems
   }
 }
 
-std::string firstLine(const std::string& text) {
-  const std::size_t begin = text.find_first_not_of(" \n");
-  if (begin == std::string::npos) return "unknown error";
-  return text.substr(begin, text.find('\n', begin) - begin);
-}
-
-/// Rows, columns and channels of the network's output, without running it.
-cv::dnn::MatShape outputShape(const cv::dnn::Net& net, const ImageSize& input) {
-  const cv::dnn::MatShape input_shape{1, 3, input.height, input.width};
-  const std::vector<int> outputs = net.getUnconnectedOutLayers();
-  if (outputs.size() != 1) {
-    throw DataError("has " + std::to_string(outputs.size()) + " outputs, must have one");
-  }
-  std::vector<cv::dnn::MatShape> in, out;
-  net.getLayerShapes(input_shape, outputs[0], in, out);
-  if (out.size() != 1 || out[0].size() != 4 || out[0][0] != 1 || out[0][1] < 1 || out[0][2] < 1 ||
-      out[0][3] < 1) {
-    std::string shape;
-    for (const cv::dnn::MatShape& one : out) {
-      for (const int n : one) shape += (shape.empty() ? "" : "x") + std::to_string(n);
-    }
-    throw DataError("output is " + shape + ", must be 1 x channels x rows x columns");
-  }
-  return out[0];
-}
-
 }  // namespace
 
 struct SegmentationModel::Impl {
@@ -238,15 +214,13 @@ SegmentationModel::SegmentationModel(const std::string& model_file, const LabelS
 
   if (!description.network_path.empty()) {
     const std::string network = "file: network '" + description.network_path + "' ";
-    std::string failure = "cannot be read by OpenCV " CV_VERSION ": ";
     try {
-      impl_->net = cv::dnn::readNetFromONNX(description.network_path);
-      impl_->net.setPreferableBackend(cv::dnn::DNN_BACKEND_OPENCV);
-      impl_->net.setPreferableTarget(cv::dnn::DNN_TARGET_CPU);
       const ImageSize& input = description.input;
       if (input.width > 0 && input.height > 0) {
-        failure = "does not take an input of " + sizeText(input) + ": ";
-        impl_->output_channels = outputShape(impl_->net, input)[1];
+        impl_->output_channels = examineNetworkApart(description.network_path, input).channels;
+        impl_->net = cv::dnn::readNetFromONNX(description.network_path);
+        impl_->net.setPreferableBackend(cv::dnn::DNN_BACKEND_OPENCV);
+        impl_->net.setPreferableTarget(cv::dnn::DNN_TARGET_CPU);
         if (!description.channels_of_class.empty()) {
           checkChannels(description, impl_->output_channels, &problems);
         }
@@ -254,7 +228,8 @@ SegmentationModel::SegmentationModel(const std::string& model_file, const LabelS
     } catch (const DataError& error) {
       problems.push_back(network + error.what());
     } catch (const cv::Exception& error) {
-      problems.push_back(network + failure + firstLine(error.err));
+      problems.push_back(network + "cannot be read by OpenCV " CV_VERSION ": " +
+                         firstLine(error.err));
     }
   }
   if (!problems.empty()) {

@@ -12,6 +12,7 @@
 #include <opencv2/dnn.hpp>
 #include <opencv2/imgcodecs.hpp>
 #include <opencv2/imgproc.hpp>
+#include <random>
 #include <set>
 #include <sstream>
 #include <string>
@@ -257,7 +258,53 @@ TEST_F(SegmentationModelTest, RefusesFilesThatAreNoNetworkOrNoModelFile) {
   std::ofstream(path("net.onnx")) << "not a network at all";
   const std::vector<std::string> found = problems("file: net.onnx\n" + rest, classes);
   ASSERT_EQ(found.size(), 1u);
-  expectProblem(found, "cannot be read by OpenCV");
+  expectProblem(found, "is no ONNX file");
+}
+
+/// A network that takes 32 x 24 and its file's bytes; 100 mutations here, SLF_MODEL_MUTATIONS by
+/// hand. Each is refused with one line, or is a network that runs.
+TEST_F(SegmentationModelTest, ADamagedNetworkIsRefusedAndKillsNothing) {
+  const LabelSet classes = classSet({"a", "b", "c", "d"});
+  writeNetwork(32, 24);
+  const std::string text =
+      "file: net.onnx\ninput: {width: 32, height: 24}\nclasses: {a: [0], b: [1], "
+      "c: [2], d: [3]}\n";
+  ASSERT_TRUE(problems(text, classes).empty());
+  std::stringstream whole;
+  whole << std::ifstream(path("net.onnx"), std::ios::binary).rdbuf();
+  const char* const wanted = std::getenv("SLF_MODEL_MUTATIONS");
+  std::mt19937 random(15);
+  int refused = 0;
+  const int mutations = wanted == nullptr ? 100 : std::atoi(wanted);
+  for (int i = 0; i < mutations; ++i) {
+    std::string bytes = whole.str();
+    if (i % 8 == 0) {
+      bytes.resize(random() % bytes.size());
+    } else {
+      for (unsigned flips = 1 + random() % 3; flips > 0; --flips) {
+        bytes[random() % bytes.size()] ^= static_cast<char>(1u << random() % 8);
+      }
+    }
+    std::ofstream(path("net.onnx"), std::ios::binary) << bytes;
+    const std::vector<std::string> said = problems(text, classes);
+    refused += said.empty() ? 0 : 1;
+    for (const std::string& problem : said) {
+      EXPECT_EQ(problem.find('\n'), std::string::npos) << problem;
+    }
+  }
+  EXPECT_GT(refused, mutations / 4);
+}
+
+TEST_F(SegmentationModelTest, ATensorThatIsShorterThanItsShapeIsNamed) {
+  ProtoMessage graph;
+  graph.message(5, onnxTensor("weights", {4, 3, 1, 1}, {1, 2, 3}));
+  std::ofstream(path("net.onnx"), std::ios::binary) << ProtoMessage().message(7, graph).text();
+  const auto said = problems("file: net.onnx\ninput: {width: 8, height: 8}\nclasses: {a: [0]}\n",
+                             classSet({"a"}));
+  ASSERT_EQ(said.size(), 1u);
+  EXPECT_NE(said[0].find("tensor 'weights' has the shape of 12 values and data of 12 bytes"),
+            std::string::npos)
+      << said[0];
 }
 
 TEST_F(SegmentationModelTest, RefusesImagesItCannotRead) {
