@@ -142,12 +142,12 @@ class Surroundings(Feed):
             self.assertEqual(stamps, sorted(stamps))
         live.wait_until(
             lambda: self.count(
-                "image_selection", "dropped: front/image, stamp disagrees with points"
+                "image_selection", "dropped: /front/image, stamp disagrees with points"
             ),
             lambda: "a count of the camera\n" + self.diagnostics.text(),
         )
         self.said.wait_for(
-            r"front/image: stamp .* s is .* s (behind|ahead of) the newest of points"
+            r"/front/image: stamp .* s is .* s (behind|ahead of) the newest of points"
         )
 
     def test_3_a_decision_older_than_all_that_are_known(self):
