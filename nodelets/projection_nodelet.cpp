@@ -192,8 +192,8 @@ class ProjectionNodelet : public FusionNodelet {
                     const sensor_msgs::ImageConstPtr& message,
                     sensor_msgs::ImageConstPtr Semantics::*part) {
     const StampNs stamp = stampNs(message->header.stamp);
-    admit(epochs_.get(), camera->config.name + " " + source, trueImageTime(*camera, stamp),
-          [this, camera, stamp, message, part] {
+    admit(epochs_.get(), camera->config.name + " " + source,
+          stamp + toNs(camera->config.time_offset_s), [this, camera, stamp, message, part] {
             if (message->width == 0 || message->height == 0) {
               health().problem(camera->config.name +
                                ": the network gave no scores for a selected image");
