@@ -52,6 +52,7 @@ EDGE = {
     "base": {"edge", "common", "sync", "config"},
     "": {"edge", "base"} | ANY_CORE,
     "tools/common": {"edge", "common"},
+    "tools/check_network": {"common", "segmentation"},
     "tools/fuse_bag": {"edge", "tools/common"} | ANY_CORE,
     "tools/simulate_drive": {"edge", "tools/common"} | ANY_CORE,
 }
