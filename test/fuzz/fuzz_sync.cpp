@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 // Sequences of calls on the classes that hold messages by stamp. Whatever comes: nothing is given
 // out twice or backwards within an epoch, what goes in comes out or is counted, memory is bounded.
+#include <limits>
 #include <map>
 #include <memory>
 #include <optional>
@@ -96,9 +97,12 @@ void runMonitor(Reader* reader) {
   }
 }
 
+/// Before every stamp.
+constexpr StampNs kNever = std::numeric_limits<StampNs>::min();
+
 struct QueueCheck {
   std::size_t in = 0, out = 0, forgotten = 0;
-  std::optional<StampNs> first_point, stamp;  ///< of the last scan with points of this epoch
+  StampNs first_point = kNever, stamp = kNever;  ///< of the last scan with points of this epoch
 
   void take(const std::vector<CompletedScan>& scans) {
     for (const CompletedScan& scan : scans) {
@@ -107,8 +111,8 @@ struct QueueCheck {
         expect(view.state != ViewState::kExpected, "a complete scan expects nothing");
       }
       if (scan.cloud->empty()) continue;
-      expect(!first_point || scan.cloud->first_point_ns > *first_point, "no scan comes out twice");
-      expect(!stamp || scan.cloud->stamp >= *stamp, "scans are not stamped backwards");
+      expect(scan.cloud->first_point_ns > first_point, "no scan comes out twice");
+      expect(scan.cloud->stamp >= stamp, "scans are not stamped backwards");
       first_point = scan.cloud->first_point_ns;
       stamp = scan.cloud->stamp;
     }
@@ -132,8 +136,7 @@ void runQueue(Reader* reader) {
       case 0:
         check.forgotten += queue.pending();
         queue.reset();
-        check.first_point.reset();
-        check.stamp.reset();
+        check.first_point = check.stamp = kNever;
         break;
       case 1:
       case 2:
@@ -176,7 +179,9 @@ struct SelectorCheck {
   struct Answers {
     int references = 0, selections = 0, dropped = 0;
   };
-  int cameras;
+  explicit SelectorCheck(int camera_count) : cameras(camera_count) {}
+
+  const int cameras;
   std::size_t complete = 0, dropped = 0;
   std::map<StampNs, Answers> scans;  ///< of this epoch
 
@@ -207,7 +212,7 @@ void runSelector(Reader* reader) {
   for (SelectorCamera& camera : config.cameras) camera.timeout_ns = reader->choice(250) * kMs;
   config.choose = static_cast<ReferenceChoice>(reader->choice(4));
   ScanSelector selector(config);
-  SelectorCheck check{static_cast<int>(config.cameras.size())};
+  SelectorCheck check(static_cast<int>(config.cameras.size()));
   StampNs now = 0;
   while (reader->left() > 0) {
     const StampNs stamp = takeStamp(reader);
