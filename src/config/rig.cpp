@@ -390,11 +390,10 @@ SegmentationConfig readSegmentation(YamlSection section, const std::string& base
 OcclusionConfig readOcclusion(YamlSection section) {
   OcclusionConfig occlusion;
   // YAML 1.1 parsers, rosparam's among them, read a plain `off` as false.
-  section.choice<OcclusionMode>("mode", &occlusion.mode,
-                                {{"off", OcclusionMode::kOff},
-                                 {"paper", OcclusionMode::kPaper},
-                                 {"adaptive", OcclusionMode::kAdaptive},
-                                 {"false", OcclusionMode::kOff}});
+  std::vector<std::pair<const char*, const OcclusionMode*>> modes;
+  for (const OcclusionMode* mode : occlusionModes()) modes.emplace_back(mode->name, mode);
+  modes.emplace_back("false", &OcclusionMode::kOff);
+  section.choice<const OcclusionMode*>("mode", &occlusion.mode, modes);
   section.number("vertical_step_deg", &occlusion.vertical_step_deg, {0, 90});
   section.number("horizontal_step_deg", &occlusion.horizontal_step_deg, {0, 90});
   section.number("depth_margin_m", &occlusion.depth_margin_m, {0, 1000});

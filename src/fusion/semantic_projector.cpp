@@ -413,9 +413,7 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
     return view.has_image && view.model;
   });
   BeamGrid grid;
-  if (any_image && !cloud.empty() && config_.occlusion.mode != OcclusionMode::kOff) {
-    grid = beamGrid(cloud, config_.occlusion, pool_.get());
-  }
+  if (any_image && !cloud.empty()) grid = beamGrid(cloud, config_.occlusion, pool_.get());
 
   std::vector<CameraOutcome> outcomes(views.size());
   pool_->forEach(static_cast<int>(views.size()), [&](int camera) {

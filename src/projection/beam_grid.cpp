@@ -34,10 +34,10 @@ std::vector<BeamGrid::Links> linksOfCloud(const RangeImage& image,
 
 BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool) {
   BeamGrid grid;
-  if (config.mode == OcclusionMode::kOff) return grid;
+  if (config.mode->needs == OcclusionMode::Needs::kNothing) return grid;
   const bool vertical_given = config.vertical_step_deg > 0.0;
   const bool horizontal_given = config.horizontal_step_deg > 0.0;
-  const bool with_links = config.mode == OcclusionMode::kAdaptive;
+  const bool with_links = config.mode->needs == OcclusionMode::Needs::kLinks;
   if (with_links || !vertical_given || !horizontal_given) {
     RangeImage image = rangeImage(cloud, config, pool);
     measureSteps(image, config, pool, &grid);

@@ -9,6 +9,33 @@
 #include "semantic_lidar_fusion/projection/surface_mask.h"
 
 namespace semantic_lidar_fusion {
+namespace {
+
+double noMarginPx(const CameraModel&, const BeamGrid&) { return 0.0; }
+
+std::vector<std::uint8_t> allVisible(const MaskInput& input) {
+  return std::vector<std::uint8_t>(input.points.size(), 1);
+}
+
+std::vector<std::uint8_t> visibleByPaperMasks(const MaskInput& input) {
+  const BeamGrid& grid = input.grid;
+  return visibleByPaper(
+      input.points, input.camera,
+      paperMaskSize(input.camera, grid.horizontal_step_rad, grid.vertical_step_rad));
+}
+
+}  // namespace
+
+const OcclusionMode OcclusionMode::kOff{"off", Needs::kNothing, noMarginPx, allVisible};
+const OcclusionMode OcclusionMode::kPaper{"paper", Needs::kSteps, noMarginPx, visibleByPaperMasks};
+const OcclusionMode OcclusionMode::kAdaptive{"adaptive", Needs::kLinks, surfaceMaskMarginPx,
+                                             visibleBySurfaces};
+
+const std::vector<const OcclusionMode*>& occlusionModes() {
+  static const std::vector<const OcclusionMode*> modes = {
+      &OcclusionMode::kOff, &OcclusionMode::kPaper, &OcclusionMode::kAdaptive};
+  return modes;
+}
 
 MaskSize paperMaskSize(const CameraModel& camera, double horizontal_step_rad,
                        double vertical_step_rad) {
@@ -23,31 +50,17 @@ MaskSize paperMaskSize(const CameraModel& camera, double horizontal_step_rad,
 
 double castMarginPx(const CameraModel& camera, const BeamGrid& grid,
                     const OcclusionConfig& config) {
-  if (config.mode != OcclusionMode::kAdaptive) return 0.0;
-  double step = std::max(grid.horizontal_step_rad, grid.vertical_step_rad);
-  for (const BeamGrid::Ring& ring : grid.rings) {
-    step = std::max({step, 2.0 * ring.half_up_rad, 2.0 * ring.half_down_rad});
-  }
-  return std::max(camera.axialFocalX(), camera.axialFocalY()) * step;
+  return config.mode->cast_margin_px(camera, grid);
 }
 
 std::vector<std::uint8_t> visiblePoints(const Cloud& cloud, const ProjectedPoints& points,
                                         const Transform& T_camera_lidar, const CameraModel& camera,
                                         const BeamGrid& grid, const OcclusionConfig& config) {
-  switch (config.mode) {
-    case OcclusionMode::kOff:
-      break;
-    case OcclusionMode::kPaper:
-      return visibleByPaper(
-          points, camera, paperMaskSize(camera, grid.horizontal_step_rad, grid.vertical_step_rad));
-    case OcclusionMode::kAdaptive:
-      if (grid.links.size() != cloud.size()) {
-        throw DataError("beam grid of " + std::to_string(grid.links.size()) + " points for " +
-                        std::to_string(cloud.size()) + ": must be that of the same cloud");
-      }
-      return visibleBySurfaces(cloud, points, T_camera_lidar, camera, grid, config);
+  if (config.mode->needs == OcclusionMode::Needs::kLinks && grid.links.size() != cloud.size()) {
+    throw DataError("beam grid of " + std::to_string(grid.links.size()) + " points for " +
+                    std::to_string(cloud.size()) + ": must be that of the same cloud");
   }
-  return std::vector<std::uint8_t>(points.size(), 1);
+  return config.mode->visible({cloud, points, T_camera_lidar, camera, grid, config});
 }
 
 }  // namespace semantic_lidar_fusion

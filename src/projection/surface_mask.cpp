@@ -84,21 +84,20 @@ class Tiles {
 
 class SurfaceMasks {
  public:
-  SurfaceMasks(const Cloud& cloud, const ProjectedPoints& points, const Transform& T_camera_lidar,
-               const CameraModel& camera, const BeamGrid& grid, const OcclusionConfig& config)
-      : cloud_(cloud),
-        points_(points),
-        T_camera_lidar_(T_camera_lidar),
-        camera_(camera),
-        grid_(grid),
-        margin_m_(static_cast<float>(config.depth_margin_m)),
-        margin_ratio_(static_cast<float>(config.depth_margin_ratio)),
-        tiles_(points, camera.imageSize(),
+  explicit SurfaceMasks(const MaskInput& input)
+      : cloud_(input.cloud),
+        points_(input.points),
+        T_camera_lidar_(input.T_camera_lidar),
+        camera_(input.camera),
+        grid_(input.grid),
+        margin_m_(static_cast<float>(input.config.depth_margin_m)),
+        margin_ratio_(static_cast<float>(input.config.depth_margin_ratio)),
+        tiles_(points_, camera_.imageSize(),
                std::max(4.0f,
-                        static_cast<float>(0.5 * camera.axialFocalY() * grid.vertical_step_rad))),
-        slot_(cloud.size(), -1) {
-    for (std::size_t i = 0; i < points.size(); ++i) {
-      slot_[points.index[i]] = static_cast<std::int32_t>(i);
+                        static_cast<float>(0.5 * camera_.axialFocalY() * grid_.vertical_step_rad))),
+        slot_(cloud_.size(), -1) {
+    for (std::size_t i = 0; i < points_.size(); ++i) {
+      slot_[points_.index[i]] = static_cast<std::int32_t>(i);
     }
   }
 
@@ -263,11 +262,16 @@ class SurfaceMasks {
 
 }  // namespace
 
-std::vector<std::uint8_t> visibleBySurfaces(const Cloud& cloud, const ProjectedPoints& points,
-                                            const Transform& T_camera_lidar,
-                                            const CameraModel& camera, const BeamGrid& grid,
-                                            const OcclusionConfig& config) {
-  return SurfaceMasks(cloud, points, T_camera_lidar, camera, grid, config).visible();
+std::vector<std::uint8_t> visibleBySurfaces(const MaskInput& input) {
+  return SurfaceMasks(input).visible();
+}
+
+double surfaceMaskMarginPx(const CameraModel& camera, const BeamGrid& grid) {
+  double step = std::max(grid.horizontal_step_rad, grid.vertical_step_rad);
+  for (const BeamGrid::Ring& ring : grid.rings) {
+    step = std::max({step, 2.0 * ring.half_up_rad, 2.0 * ring.half_down_rad});
+  }
+  return std::max(camera.axialFocalX(), camera.axialFocalY()) * step;
 }
 
 }  // namespace semantic_lidar_fusion

@@ -117,12 +117,12 @@ BENCHMARK(projectionOpencv)
     ->Name("projection/cv::fisheye::projectPoints")
     ->Unit(benchmark::kMicrosecond);
 
-void occlusionOurs(benchmark::State& state, OcclusionMode mode) {
+void occlusionOurs(benchmark::State& state, const OcclusionMode* mode) {
   const CameraModel camera(lens(), {});
   const Transform T_camera_lidar = cameraFromLidar(0.0);
   OcclusionConfig config;
   config.mode = mode;
-  if (mode == OcclusionMode::kPaper) {
+  if (mode == &OcclusionMode::kPaper) {
     config.vertical_step_deg = 2.0;
     config.horizontal_step_deg = 0.1;
   }
@@ -135,10 +135,10 @@ void occlusionOurs(benchmark::State& state, OcclusionMode mode) {
   }
   state.counters["points"] = static_cast<double>(points.size());
 }
-BENCHMARK_CAPTURE(occlusionOurs, paper, OcclusionMode::kPaper)
+BENCHMARK_CAPTURE(occlusionOurs, paper, &OcclusionMode::kPaper)
     ->Name("occlusion/ours")
     ->Unit(benchmark::kMicrosecond);
-BENCHMARK_CAPTURE(occlusionOurs, adaptive, OcclusionMode::kAdaptive)
+BENCHMARK_CAPTURE(occlusionOurs, adaptive, &OcclusionMode::kAdaptive)
     ->Name("occlusion_adaptive/ours")
     ->Unit(benchmark::kMicrosecond);
 
@@ -179,7 +179,7 @@ void occlusionPeer(benchmark::State& state) {
 BENCHMARK(occlusionPeer)->Name("occlusion/kdtree+cv::rectangle")->Unit(benchmark::kMicrosecond);
 
 /// All of the reference rig's five cameras, scores and share of 640x402 cells.
-void fuseRig(benchmark::State& state, OcclusionMode mode, int threads) {
+void fuseRig(benchmark::State& state, const OcclusionMode* mode, int threads) {
   const auto model = std::make_shared<const CameraModel>(lens(), CameraModelOptions{});
   cv::RNG random(3);
   std::vector<CameraView> views;
@@ -211,21 +211,21 @@ void fuseRig(benchmark::State& state, OcclusionMode mode, int threads) {
   }
   state.counters["fused"] = static_cast<double>(fused);
 }
-BENCHMARK_CAPTURE(fuseRig, paper, OcclusionMode::kPaper, 1)
+BENCHMARK_CAPTURE(fuseRig, paper, &OcclusionMode::kPaper, 1)
     ->Name("fuse_five_cameras/ours_paper")
     ->Unit(benchmark::kMicrosecond);
-BENCHMARK_CAPTURE(fuseRig, adaptive, OcclusionMode::kAdaptive, 1)
+BENCHMARK_CAPTURE(fuseRig, adaptive, &OcclusionMode::kAdaptive, 1)
     ->Name("fuse_five_cameras/ours_adaptive")
     ->Unit(benchmark::kMicrosecond);
-BENCHMARK_CAPTURE(fuseRig, off, OcclusionMode::kOff, 1)
+BENCHMARK_CAPTURE(fuseRig, off, &OcclusionMode::kOff, 1)
     ->Name("fuse_five_cameras/ours_off")
     ->Unit(benchmark::kMicrosecond);
 /// Time on the clock, which means nothing unless a second core is idle.
-BENCHMARK_CAPTURE(fuseRig, paper_two_threads, OcclusionMode::kPaper, 2)
+BENCHMARK_CAPTURE(fuseRig, paper_two_threads, &OcclusionMode::kPaper, 2)
     ->Name("fuse_five_cameras/ours_paper_two_threads")
     ->UseRealTime()
     ->Unit(benchmark::kMicrosecond);
-BENCHMARK_CAPTURE(fuseRig, two_threads, OcclusionMode::kAdaptive, 2)
+BENCHMARK_CAPTURE(fuseRig, two_threads, &OcclusionMode::kAdaptive, 2)
     ->Name("fuse_five_cameras/ours_adaptive_two_threads")
     ->UseRealTime()
     ->Unit(benchmark::kMicrosecond);

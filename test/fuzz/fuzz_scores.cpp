@@ -180,7 +180,7 @@ void run(const std::uint8_t* data, std::size_t size) {
   FusionConfig config;
   config.class_count = kClasses;
   config.uncertainty = uncertainty;
-  config.occlusion.mode = static_cast<OcclusionMode>(more % 3);
+  config.occlusion.mode = occlusionModes()[more % occlusionModes().size()];
   config.overlap = static_cast<OverlapRule>((more >> 2) % 4);
   config.keep_unlabelled = more & 64u;
   const Cloud cloud = cloudOf(&reader);

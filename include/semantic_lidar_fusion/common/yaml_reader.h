@@ -8,7 +8,6 @@
 #include <yaml-cpp/yaml.h>
 
 #include <algorithm>
-#include <initializer_list>
 #include <limits>
 #include <string>
 #include <utility>
@@ -68,7 +67,7 @@ class YamlSection {
   /// One of some names; of several names for a value the first is the one in messages.
   template <typename Value>
   void choice(const std::string& key, Value* value,
-              std::initializer_list<std::pair<const char*, Value>> options) {
+              const std::vector<std::pair<const char*, Value>>& options) {
     std::vector<std::string> names, shown;
     for (auto option = options.begin(); option != options.end(); ++option) {
       names.emplace_back(option->first);

@@ -27,12 +27,13 @@ struct BeamGrid {
   };
   static constexpr std::int32_t kNoLink = -1;
 
-  /// By ring number; of rings without points all zero. Empty in mode `paper` with both steps given.
+  /// By ring number; of rings without points all zero. Empty where only the steps are needed and
+  /// `config` gives both.
   std::vector<Ring> rings;
   double vertical_step_rad = 0;  ///< median over rings
   double horizontal_step_rad = 0;
-  /// Adaptive only, by cloud index: the ring (a made-up one if the cloud has none; kNoRing for
-  /// points that cast no mask) and the links.
+  /// Of modes that need links, by cloud index: the ring (a made-up one if the cloud has none;
+  /// kNoRing for points that cast no mask) and the links.
   std::vector<std::uint16_t> ring;
   std::vector<Links> links;
 };

@@ -30,10 +30,21 @@ struct MaskSize {
 MaskSize paperMaskSize(const CameraModel& camera, double horizontal_step_rad,
                        double vertical_step_rad);
 
+/// What a mode of occlusion decides from: one camera's view of a cloud.
+struct MaskInput {
+  const Cloud& cloud;
+  const ProjectedPoints& points;
+  const Transform& T_camera_lidar;  ///< lidar at the cloud's stamp to camera at its image's time
+  const CameraModel& camera;
+  const BeamGrid& grid;  ///< of the same cloud
+  const OcclusionConfig& config;
+};
+
 /// Pixels beyond the image within which points may cast into it.
 double castMarginPx(const CameraModel& camera, const BeamGrid& grid, const OcclusionConfig& config);
 
-/// 1 = visible, 0 = hidden, for each of `points`. Meaningless for points outside the image.
+/// 1 = visible, 0 = hidden, for each of `points`. Meaningless for points outside the image. Throws
+/// DataError if the mode needs links and `grid` is not that of `cloud`.
 std::vector<std::uint8_t> visiblePoints(const Cloud& cloud, const ProjectedPoints& points,
                                         const Transform& T_camera_lidar, const CameraModel& camera,
                                         const BeamGrid& grid, const OcclusionConfig& config);

@@ -16,18 +16,13 @@
 #include <cstdint>
 #include <vector>
 
-#include "semantic_lidar_fusion/camera/camera_model.h"
-#include "semantic_lidar_fusion/common/point_cloud.h"
-#include "semantic_lidar_fusion/projection/beam_grid.h"
-#include "semantic_lidar_fusion/projection/cloud_projector.h"
+#include "semantic_lidar_fusion/projection/occlusion_mask.h"
 
 namespace semantic_lidar_fusion {
 
-/// 1 = visible, 0 = hidden, for each of `points`. Meaningless for points outside the image. `grid`
-/// is that of `cloud` in mode adaptive.
-std::vector<std::uint8_t> visibleBySurfaces(const Cloud& cloud, const ProjectedPoints& points,
-                                            const Transform& T_camera_lidar,
-                                            const CameraModel& camera, const BeamGrid& grid,
-                                            const OcclusionConfig& config);
+/// Mode `adaptive`: 1 = visible, 0 = hidden, for each point; 0 outside the image.
+std::vector<std::uint8_t> visibleBySurfaces(const MaskInput& input);
+/// What the widest beam cell of `grid` covers in the image, px.
+double surfaceMaskMarginPx(const CameraModel& camera, const BeamGrid& grid);
 
 }  // namespace semantic_lidar_fusion

@@ -65,7 +65,7 @@ TEST(RigTest, EmptyRigHasTheDefaultsOfTheStructs) {
   EXPECT_EQ(rig.motion_granularity, MotionGranularity::kFiring);
   EXPECT_EQ(rig.reference.choose, ReferenceChoice::kClosestImage);
   EXPECT_EQ(rig.image_choice, ImageChoice::kClosestToReference);
-  EXPECT_EQ(rig.occlusion.mode, OcclusionMode::kAdaptive);
+  EXPECT_EQ(rig.occlusion.mode, &OcclusionMode::kAdaptive);
   EXPECT_EQ(rig.occlusion.depth_margin_m, 0.3);
   EXPECT_EQ(rig.occlusion.depth_margin_ratio, 0.10);
   EXPECT_EQ(rig.lidar.without_time, WithoutTime::kInstant);
@@ -177,7 +177,7 @@ threads: 3
   EXPECT_EQ(rig.image_choice, ImageChoice::kClosestToSweep);
   EXPECT_EQ(rig.segmentation.model, kConfigFolder + "/usyd.yaml");
   EXPECT_EQ(rig.segmentation.mode, SegmentationMode::kOnRequest);
-  EXPECT_EQ(rig.occlusion.mode, OcclusionMode::kPaper);
+  EXPECT_EQ(rig.occlusion.mode, &OcclusionMode::kPaper);
   EXPECT_EQ(rig.occlusion.vertical_step_deg, 2);
   EXPECT_EQ(rig.occlusion.horizontal_step_deg, 0.1);
   EXPECT_EQ(rig.occlusion.depth_margin_m, 0);
@@ -416,13 +416,20 @@ TEST(RigTest, SixteenCamerasAndNoMore) {
             std::string::npos);
 }
 
+TEST(RigTest, KnowsEveryModeOfOcclusionByItsName) {
+  ASSERT_EQ(occlusionModes().size(), 3u);
+  for (const OcclusionMode* mode : occlusionModes()) {
+    EXPECT_EQ(parse("occlusion: {mode: " + std::string(mode->name) + "}").occlusion.mode, mode);
+  }
+}
+
 TEST(OverrideTest, SetsValuesMakesSectionsAndWorksInOrder) {
   const Rig rig =
       parse(kTwoCameras, {"occlusion.mode=paper", "cameras.right.max_theta_deg=50",
                           "cameras.0.max_theta_deg=40", "overlap=mean", "overlap=product",
                           "lidar.vertical_offsets_m=[0.1, 0.2]", "lidar.vertical_offsets_m.1=0.3",
                           "lidar.frame=", "uncertainty={temperature: 2, exponent: 1}", "name=a b"});
-  EXPECT_EQ(rig.occlusion.mode, OcclusionMode::kPaper);
+  EXPECT_EQ(rig.occlusion.mode, &OcclusionMode::kPaper);
   EXPECT_EQ(rig.cameras[1].max_theta_deg, 50);
   EXPECT_EQ(rig.cameras[0].max_theta_deg, 40);
   EXPECT_EQ(rig.overlap, OverlapRule::kProduct);
@@ -430,7 +437,7 @@ TEST(OverrideTest, SetsValuesMakesSectionsAndWorksInOrder) {
   EXPECT_EQ(rig.uncertainty.temperature, 2);
   EXPECT_EQ(rig.name, "a b");
   EXPECT_TRUE(parse(kTwoCameras, {"cameras=[]"}).cameras.empty());
-  EXPECT_EQ(parse("occlusion:\n", {"occlusion.mode=off"}).occlusion.mode, OcclusionMode::kOff);
+  EXPECT_EQ(parse("occlusion:\n", {"occlusion.mode=off"}).occlusion.mode, &OcclusionMode::kOff);
   EXPECT_EQ(parse("", {"motion.enabled=false"}).motion_enabled, false);
 }
 

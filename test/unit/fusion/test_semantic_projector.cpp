@@ -188,9 +188,9 @@ std::vector<ReferencePoint> referenceFuse(const Cloud& cloud, const std::vector<
     const ProjectedPoints points = projectCloud(cloud, T, *view.model, margin_px);
 
     std::vector<std::uint8_t> visible(points.size(), 1);
-    if (config.occlusion.mode == OcclusionMode::kAdaptive) {
+    if (config.occlusion.mode == &OcclusionMode::kAdaptive) {
       visible = visiblePoints(cloud, points, T, *view.model, grid, config.occlusion);
-    } else if (config.occlusion.mode == OcclusionMode::kPaper) {
+    } else if (config.occlusion.mode == &OcclusionMode::kPaper) {
       const MaskSize mask =
           paperMaskSize(*view.model, grid.horizontal_step_rad, grid.vertical_step_rad);
       std::vector<std::size_t> order(points.size());
@@ -348,7 +348,7 @@ struct Scene {
 
 struct Variant {
   OverlapRule overlap;
-  OcclusionMode occlusion;
+  const OcclusionMode* occlusion;
 };
 
 class RandomScenes : public ::testing::TestWithParam<Variant> {};
@@ -399,7 +399,7 @@ TEST_P(RandomScenes, EqualTheReference) {
   }
   // The scenes reach every status and rule.
   for (const int status : {0, 2, 3, 4}) EXPECT_GT(points_of_status[status], 20) << status;
-  EXPECT_EQ(points_of_status[1] > 20, GetParam().occlusion != OcclusionMode::kOff);
+  EXPECT_EQ(points_of_status[1] > 20, GetParam().occlusion != &OcclusionMode::kOff);
   const bool merges =
       GetParam().overlap == OverlapRule::kMean || GetParam().overlap == OverlapRule::kProduct;
   EXPECT_EQ(shared_points > 20, merges);
@@ -407,14 +407,14 @@ TEST_P(RandomScenes, EqualTheReference) {
 
 INSTANTIATE_TEST_SUITE_P(
     SemanticProjector, RandomScenes,
-    ::testing::Values(Variant{OverlapRule::kMean, OcclusionMode::kOff},
-                      Variant{OverlapRule::kProduct, OcclusionMode::kOff},
-                      Variant{OverlapRule::kNearestInTime, OcclusionMode::kOff},
-                      Variant{OverlapRule::kMostCentral, OcclusionMode::kOff},
-                      Variant{OverlapRule::kMean, OcclusionMode::kPaper},
-                      Variant{OverlapRule::kProduct, OcclusionMode::kPaper},
-                      Variant{OverlapRule::kNearestInTime, OcclusionMode::kAdaptive},
-                      Variant{OverlapRule::kMean, OcclusionMode::kAdaptive}));
+    ::testing::Values(Variant{OverlapRule::kMean, &OcclusionMode::kOff},
+                      Variant{OverlapRule::kProduct, &OcclusionMode::kOff},
+                      Variant{OverlapRule::kNearestInTime, &OcclusionMode::kOff},
+                      Variant{OverlapRule::kMostCentral, &OcclusionMode::kOff},
+                      Variant{OverlapRule::kMean, &OcclusionMode::kPaper},
+                      Variant{OverlapRule::kProduct, &OcclusionMode::kPaper},
+                      Variant{OverlapRule::kNearestInTime, &OcclusionMode::kAdaptive},
+                      Variant{OverlapRule::kMean, &OcclusionMode::kAdaptive}));
 
 void expectSameBytes(const FusionResult& a, const FusionResult& b) {
   EXPECT_EQ(a.cloud.points.status, b.cloud.points.status);
@@ -452,7 +452,7 @@ TEST(SemanticProjector, GivesTheSameBytesForEveryOrderOfCameras) {
     FusionConfig config;
     config.class_count = Scene::kClasses;
     config.overlap = rule;
-    config.occlusion.mode = OcclusionMode::kPaper;
+    config.occlusion.mode = &OcclusionMode::kPaper;
     const SemanticProjector projector(config);
     std::vector<int> order(scene.views.size());
     std::iota(order.begin(), order.end(), 0);
@@ -501,7 +501,7 @@ Cloud handCloud() {
 FusionConfig handConfig() {
   FusionConfig config;
   config.class_count = 2;
-  config.occlusion.mode = OcclusionMode::kPaper;  // a step of 2 deg is 0.35 px: one-pixel masks
+  config.occlusion.mode = &OcclusionMode::kPaper;  // a step of 2 deg is 0.35 px: one-pixel masks
   config.occlusion.horizontal_step_deg = 2.0;
   config.occlusion.vertical_step_deg = 2.0;
   return config;
@@ -511,8 +511,35 @@ std::vector<int> statuses(const FusionResult& result) {
   return {result.cloud.points.status.begin(), result.cloud.points.status.end()};
 }
 
+/// A mode of occlusion made of one row: it hides what has no left or right neighbour on its
+/// surface.
+std::vector<std::uint8_t> visibleIfLinked(const MaskInput& input) {
+  std::vector<std::uint8_t> visible;
+  for (const std::uint32_t i : input.points.index) {
+    const BeamGrid::Links& links = input.grid.links[i];
+    visible.push_back(links.left != BeamGrid::kNoLink || links.right != BeamGrid::kNoLink);
+  }
+  return visible;
+}
+
+TEST(SemanticProjector, TakesAModeOfOcclusionOfSomebodyElse) {
+  const OcclusionMode linked{"linked", OcclusionMode::Needs::kLinks,
+                             [](const CameraModel&, const BeamGrid&) { return 7.0; },
+                             visibleIfLinked};
+  FusionConfig config = handConfig();
+  config.occlusion.mode = &linked;
+  Cloud cloud = handCloud();
+  for (const int column : {8, 9, 10}) addPoint(&cloud, pointAt(column, 5, 10.0), 0);
+  addPoint(&cloud, pointAt(10, 3, 4.0), 1);  // nothing beside it
+  config.occlusion.horizontal_step_deg = 5.0;
+  config.occlusion.vertical_step_deg = 10.0;
+  const FusionResult result = SemanticProjector(config).fuse(cloud, {handCamera()});
+  EXPECT_EQ(statuses(result), (std::vector<int>{0, 0, 0, 1}));
+  EXPECT_EQ(castMarginPx(*handCamera().model, {}, config.occlusion), 7.0);
+}
+
 TEST(SemanticProjector, GivesTheSameBytesForEveryNumberOfThreads) {
-  for (const OcclusionMode occlusion : {OcclusionMode::kPaper, OcclusionMode::kAdaptive}) {
+  for (const OcclusionMode* occlusion : {&OcclusionMode::kPaper, &OcclusionMode::kAdaptive}) {
     Scene scene(4);
     scene.cloud = [] {
       std::mt19937 random(4);

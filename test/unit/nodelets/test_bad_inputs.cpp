@@ -221,7 +221,7 @@ Cloud wall() {
 std::string fusedWall(const ImageSemantics& semantics) {
   FusionConfig config;
   config.class_count = kClasses;
-  config.occlusion.mode = OcclusionMode::kOff;
+  config.occlusion.mode = &OcclusionMode::kOff;
   CameraView view;
   view.name = "camera";
   view.model = pinhole();

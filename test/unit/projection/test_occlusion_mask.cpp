@@ -24,7 +24,7 @@ CameraModel fisheye(double focal_px, int width, int height) {
 
 CameraModel referenceCamera() { return fisheye(1166.0, 1928, 1208); }
 
-OcclusionConfig mode(OcclusionMode mode, double horizontal_step_deg = 0.0,
+OcclusionConfig mode(const OcclusionMode* mode, double horizontal_step_deg = 0.0,
                      double vertical_step_deg = 0.0) {
   OcclusionConfig config;
   config.mode = mode;
@@ -141,7 +141,7 @@ std::vector<std::uint8_t> paperReference(const ProjectedPoints& points, const Im
 void expectPaperEqualsReference(const ProjectedPoints& points, const CameraModel& camera,
                                 double horizontal_step_deg, double vertical_step_deg) {
   const OcclusionConfig config =
-      mode(OcclusionMode::kPaper, horizontal_step_deg, vertical_step_deg);
+      mode(&OcclusionMode::kPaper, horizontal_step_deg, vertical_step_deg);
   BeamGrid grid;
   grid.horizontal_step_rad = radians(horizontal_step_deg);
   grid.vertical_step_rad = radians(vertical_step_deg);
@@ -199,15 +199,15 @@ TEST(PaperMask, EqualsBruteForceOnScenes) {
 
 TEST(PaperMask, StepsComeFromTheDataUnlessGiven) {
   const LidarScan scan = scanScene(PanelScene().scene, lidarPose(1.7), LidarPattern::vlp16(0.2), 2);
-  const BeamGrid measured = beamGrid(scan.cloud, mode(OcclusionMode::kPaper));
+  const BeamGrid measured = beamGrid(scan.cloud, mode(&OcclusionMode::kPaper));
   const MaskSize mask =
       paperMaskSize(referenceCamera(), measured.horizontal_step_rad, measured.vertical_step_rad);
   EXPECT_EQ(mask.width, 5);
   EXPECT_EQ(mask.height, 41);
-  const BeamGrid given = beamGrid(scan.cloud, mode(OcclusionMode::kPaper, 0.1, 1.0));
+  const BeamGrid given = beamGrid(scan.cloud, mode(&OcclusionMode::kPaper, 0.1, 1.0));
   EXPECT_DOUBLE_EQ(given.horizontal_step_rad, radians(0.1));
   EXPECT_DOUBLE_EQ(given.vertical_step_rad, radians(1.0));
-  EXPECT_EQ(castMarginPx(referenceCamera(), given, mode(OcclusionMode::kPaper)), 0.0);
+  EXPECT_EQ(castMarginPx(referenceCamera(), given, mode(&OcclusionMode::kPaper)), 0.0);
 }
 
 TEST(Off, EveryPointIsVisible) {
@@ -217,7 +217,7 @@ TEST(Off, EveryPointIsVisible) {
   points.distance = {1.0f, 9.0f};
   points.theta = {0.0f, 0.0f};
   const auto visible = visiblePoints(Cloud(), points, Transform::Identity(), referenceCamera(), {},
-                                     mode(OcclusionMode::kOff));
+                                     mode(&OcclusionMode::kOff));
   EXPECT_EQ(visible, (std::vector<std::uint8_t>{1, 1}));
 }
 
@@ -228,7 +228,7 @@ constexpr double kStepTolerance = 0.05;
 
 void expectSteps(const Cloud& cloud, double azimuth_deg, double elevation_deg,
                  const std::string& what) {
-  const BeamGrid grid = beamGrid(cloud, mode(OcclusionMode::kAdaptive));
+  const BeamGrid grid = beamGrid(cloud, mode(&OcclusionMode::kAdaptive));
   EXPECT_NEAR(grid.horizontal_step_rad, radians(azimuth_deg), kStepTolerance * radians(azimuth_deg))
       << what;
   EXPECT_NEAR(grid.vertical_step_rad, radians(elevation_deg),
@@ -306,7 +306,7 @@ TEST(BeamGrid, StepsSurviveWhatRealDataDoes) {
     moved.y[i] = static_cast<float>(p.y());
     moved.z[i] = static_cast<float>(p.z());
   }
-  const BeamGrid grid = beamGrid(moved, mode(OcclusionMode::kAdaptive));
+  const BeamGrid grid = beamGrid(moved, mode(&OcclusionMode::kAdaptive));
   EXPECT_NEAR(grid.horizontal_step_rad, radians(0.2), 0.15 * radians(0.2));
   EXPECT_NEAR(grid.vertical_step_rad, radians(2.0), 0.05 * radians(2.0));
 }
@@ -315,7 +315,7 @@ TEST(BeamGrid, UnevenRingsReachHalfWayToTheirNeighbours) {
   LidarPattern pattern = LidarPattern::vlp16(0.2);
   pattern.elevation_deg = {-25.0, -15.0, -10.0, -8.0, -7.0};
   const Cloud cloud = scanScene(streetScene(1), lidarPose(1.9), pattern, 3).cloud;
-  const BeamGrid grid = beamGrid(cloud, mode(OcclusionMode::kAdaptive));
+  const BeamGrid grid = beamGrid(cloud, mode(&OcclusionMode::kAdaptive));
   ASSERT_EQ(grid.rings.size(), 5u);
   EXPECT_NEAR(grid.rings[1].half_up_rad, radians(2.5), 1e-3);
   EXPECT_NEAR(grid.rings[1].half_down_rad, radians(5.0), 1e-3);
@@ -327,7 +327,7 @@ TEST(BeamGrid, UnevenRingsReachHalfWayToTheirNeighbours) {
 TEST(BeamGrid, GivenStepsOverrideTheData) {
   const Cloud cloud =
       scanScene(PanelScene().scene, lidarPose(1.7), LidarPattern::vlp16(0.2), 3).cloud;
-  const BeamGrid grid = beamGrid(cloud, mode(OcclusionMode::kAdaptive, 0.3, 1.0));
+  const BeamGrid grid = beamGrid(cloud, mode(&OcclusionMode::kAdaptive, 0.3, 1.0));
   EXPECT_DOUBLE_EQ(grid.horizontal_step_rad, radians(0.3));
   EXPECT_DOUBLE_EQ(grid.vertical_step_rad, radians(1.0));
   EXPECT_DOUBLE_EQ(grid.rings[3].half_azimuth_rad, radians(0.15));
@@ -339,31 +339,31 @@ TEST(BeamGrid, WithoutRingsTheVerticalStepMustBeGiven) {
   Cloud cloud = scanScene(PanelScene().scene, lidarPose(1.7), LidarPattern::vlp16(0.2), 3).cloud;
   std::fill(cloud.ring.begin(), cloud.ring.end(), kNoRing);
   try {
-    beamGrid(cloud, mode(OcclusionMode::kAdaptive));
+    beamGrid(cloud, mode(&OcclusionMode::kAdaptive));
     ADD_FAILURE() << "accepted";
   } catch (const DataError& error) {
     const std::string message = error.what();
     EXPECT_NE(message.find("ring"), std::string::npos) << message;
     EXPECT_NE(message.find("occlusion.vertical_step_deg = 0"), std::string::npos) << message;
   }
-  const BeamGrid grid = beamGrid(cloud, mode(OcclusionMode::kAdaptive, 0.0, 2.0));
+  const BeamGrid grid = beamGrid(cloud, mode(&OcclusionMode::kAdaptive, 0.0, 2.0));
   EXPECT_NEAR(grid.horizontal_step_rad, radians(0.2), kStepTolerance * radians(0.2));
   // The made-up rings are the real ones.
   const BeamGrid real =
       beamGrid(scanScene(PanelScene().scene, lidarPose(1.7), LidarPattern::vlp16(0.2), 3).cloud,
-               mode(OcclusionMode::kAdaptive, 0.0, 2.0));
+               mode(&OcclusionMode::kAdaptive, 0.0, 2.0));
   EXPECT_EQ(grid.ring, real.ring);
-  EXPECT_NO_THROW(beamGrid(cloud, mode(OcclusionMode::kOff)));
+  EXPECT_NO_THROW(beamGrid(cloud, mode(&OcclusionMode::kOff)));
 }
 
 TEST(BeamGrid, EmptyAndUnusablePoints) {
   Cloud cloud;
-  EXPECT_TRUE(beamGrid(cloud, mode(OcclusionMode::kAdaptive)).links.empty());
+  EXPECT_TRUE(beamGrid(cloud, mode(&OcclusionMode::kAdaptive)).links.empty());
   cloud.x = {1.0f, 0.0f, std::nanf(""), 2.0f};
   cloud.y = cloud.z = {0.0f, 0.0f, 0.0f, 0.0f};
   cloud.ring = {0, 0, 0, 0};
   cloud.status = {static_cast<std::uint8_t>(PointStatus::kNoOdometry), 0, 0, 0};
-  const BeamGrid grid = beamGrid(cloud, mode(OcclusionMode::kAdaptive));
+  const BeamGrid grid = beamGrid(cloud, mode(&OcclusionMode::kAdaptive));
   ASSERT_EQ(grid.ring.size(), 4u);
   EXPECT_EQ(grid.ring[0], kNoRing);
   EXPECT_EQ(grid.ring[1], kNoRing);
@@ -377,7 +377,7 @@ TEST(BeamGrid, LinksStayOnOneSurface) {
   for (const double step : {0.1, 0.2}) {
     const LidarScan scan =
         scanScene(panel.scene, lidarPose(1.7, 7.0), LidarPattern::vlp16(step), 3);
-    const BeamGrid grid = beamGrid(scan.cloud, mode(OcclusionMode::kAdaptive));
+    const BeamGrid grid = beamGrid(scan.cloud, mode(&OcclusionMode::kAdaptive));
     int ground_up = 0, ground_beside = 0, ground = 0, panel_to_wall = 0;
     for (std::size_t i = 0; i < scan.cloud.size(); ++i) {
       const BeamGrid::Links& links = grid.links[i];
@@ -424,7 +424,7 @@ TEST(BeamGrid, NoiseAtCloseRangeLinksNothingFarAway) {
     cloud.y[i] *= scale;
     cloud.z[i] *= scale;
   }
-  const BeamGrid grid = beamGrid(cloud, mode(OcclusionMode::kAdaptive));
+  const BeamGrid grid = beamGrid(cloud, mode(&OcclusionMode::kAdaptive));
   int links = 0;
   for (std::size_t i = 0; i < cloud.size(); ++i) {
     const BeamGrid::Links& own = grid.links[i];
@@ -548,7 +548,7 @@ class AdaptiveReference {
 };
 
 TEST(AdaptiveMask, EqualsBruteForceWhereTheDecisionIsNotOnAnEdge) {
-  const OcclusionConfig config = mode(OcclusionMode::kAdaptive);
+  const OcclusionConfig config = mode(&OcclusionMode::kAdaptive);
   LidarPattern pattern = LidarPattern::vlp16(0.2);
   pattern.azimuth_begin_deg = -14.0;
   pattern.azimuth_end_deg = 14.0;
@@ -604,7 +604,7 @@ TEST(AdaptiveMask, ABeamOnItsOwnCastsItsCell) {
     cloud.ring.push_back(static_cast<std::uint16_t>(ring));
     cloud.status.push_back(0);
   };
-  OcclusionConfig config = mode(OcclusionMode::kAdaptive, 0.2, 2.0);
+  OcclusionConfig config = mode(&OcclusionMode::kAdaptive, 0.2, 2.0);
   Transform T_lidar_camera = Transform::Identity();
   T_lidar_camera.linear() = bodyFromOptical();
   const Transform T_camera_lidar = T_lidar_camera.inverse();
@@ -643,7 +643,7 @@ TEST(AdaptiveMask, PointsOutsideTheImageCastIntoIt) {
   scene.addPanel(25.0, -30.0, 25.0, 30.0, 0.0, 8.0);
   const Transform T_world_lidar = lidarPose(1.9);
   const LidarScan scan = scanScene(scene, T_world_lidar, LidarPattern::vlp16(0.2), 5);
-  const OcclusionConfig config = mode(OcclusionMode::kAdaptive);
+  const OcclusionConfig config = mode(&OcclusionMode::kAdaptive);
   const BeamGrid grid = beamGrid(scan.cloud, config);
   const CameraModel camera = fisheye(1166.0, 600, 61);  // +- 1.5 deg high
   const Transform T_world_camera = cameraPose(1.9, 0.8, 0.0);
@@ -668,7 +668,7 @@ TEST(AdaptiveMask, RefusesTheGridOfAnotherCloud) {
   cloud.ring = {0};
   cloud.status = {0};
   EXPECT_THROW(visiblePoints(cloud, {}, Transform::Identity(), referenceCamera(), {},
-                             mode(OcclusionMode::kAdaptive)),
+                             mode(&OcclusionMode::kAdaptive)),
                DataError);
 }
 
@@ -781,11 +781,11 @@ constexpr double kMostLost = 0.005;
 TEST(AdaptiveRates, PanelBeforeAWall) {
   const PanelScene panel;
   for (const auto& [below, aside] : kOffsets) {
-    const Rates rates = panelRates(mode(OcclusionMode::kAdaptive), below, aside);
+    const Rates rates = panelRates(mode(&OcclusionMode::kAdaptive), below, aside);
     report("panel", below, aside, "adaptive", rates);
-    const Rates paper_01 = panelRates(mode(OcclusionMode::kPaper, 0.1, 2.0), below, aside);
+    const Rates paper_01 = panelRates(mode(&OcclusionMode::kPaper, 0.1, 2.0), below, aside);
     report("panel", below, aside, "3 x 41  ", paper_01);
-    const Rates paper_02 = panelRates(mode(OcclusionMode::kPaper, 0.2, 2.0), below, aside);
+    const Rates paper_02 = panelRates(mode(&OcclusionMode::kPaper, 0.2, 2.0), below, aside);
     report("panel", below, aside, "5 x 41  ", paper_02);
     EXPECT_GE(rates.caughtShare(), kLeastCaught) << below << " " << aside;
     for (const int object : {panel.ground, panel.facade, panel.panel}) {
@@ -806,10 +806,10 @@ TEST(AdaptiveRates, BareGroundHidesNothing) {
     for (const auto& [below, aside] : kOffsets) {
       Rates adaptive, paper;
       const Transform T_world_camera = cameraPose(1.7, below, aside);
-      measure(scene, scan, T_world_lidar, T_world_camera, mode(OcclusionMode::kAdaptive),
+      measure(scene, scan, T_world_lidar, T_world_camera, mode(&OcclusionMode::kAdaptive),
               &adaptive);
       EXPECT_LE(adaptive.lostShare(), kMostLost) << below << " " << aside << " " << pitch;
-      measure(scene, scan, T_world_lidar, T_world_camera, mode(OcclusionMode::kPaper, 0.1, 2.0),
+      measure(scene, scan, T_world_lidar, T_world_camera, mode(&OcclusionMode::kPaper, 0.1, 2.0),
               &paper);
       if (below == 1.0 && pitch == 0.0) {
         EXPECT_GT(paper.lostShare(), 0.1);
@@ -830,11 +830,11 @@ TEST(AdaptiveRates, Street) {
       const Transform T_world_lidar = lidarPose(1.9);
       const LidarScan scan = scanScene(scene, T_world_lidar, LidarPattern::vlp16(0.2), seed);
       const Transform T_world_camera = cameraPose(1.9, below, aside, 20.0 * (seed - 2.0));
-      measure(scene, scan, T_world_lidar, T_world_camera, mode(OcclusionMode::kAdaptive),
+      measure(scene, scan, T_world_lidar, T_world_camera, mode(&OcclusionMode::kAdaptive),
               &adaptive);
-      measure(scene, scan, T_world_lidar, T_world_camera, mode(OcclusionMode::kPaper, 0.1, 2.0),
+      measure(scene, scan, T_world_lidar, T_world_camera, mode(&OcclusionMode::kPaper, 0.1, 2.0),
               &paper_01);
-      measure(scene, scan, T_world_lidar, T_world_camera, mode(OcclusionMode::kPaper, 0.2, 2.0),
+      measure(scene, scan, T_world_lidar, T_world_camera, mode(&OcclusionMode::kPaper, 0.2, 2.0),
               &paper_02);
     }
     report("street", below, aside, "adaptive", adaptive);
