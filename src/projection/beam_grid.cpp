@@ -32,18 +32,22 @@ std::vector<BeamGrid::Links> linksOfCloud(const RangeImage& image,
 
 }  // namespace
 
-BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool) {
+BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool,
+                  bool with_links) {
+  using Needs = OcclusionMode::Needs;
   BeamGrid grid;
-  if (config.mode->needs == OcclusionMode::Needs::kNothing) return grid;
+  const Needs needs = config.mode->needs;
+  with_links = with_links || needs == Needs::kLinks;
+  if (needs == Needs::kNothing && !with_links) return grid;
   const bool vertical_given = config.vertical_step_deg > 0.0;
   const bool horizontal_given = config.horizontal_step_deg > 0.0;
-  const bool with_links = config.mode->needs == OcclusionMode::Needs::kLinks;
   if (with_links || !vertical_given || !horizontal_given) {
     RangeImage image = rangeImage(cloud, config, pool);
     measureSteps(image, config, pool, &grid);
     if (with_links) {
       grid.links = linksOfCloud(image, linkSurfaces(image, config, grid, pool), cloud.size(), pool);
       grid.ring = std::move(image.row_of);
+      grid.note = std::move(image.note);
     }
   }
   if (vertical_given) grid.vertical_step_rad = radians(config.vertical_step_deg);

@@ -92,52 +92,70 @@ std::vector<float> measureRows(const RangeImage& image, ThreadPool* pool, BeamGr
   return all;
 }
 
-/// Half-way up and down to the next rings, from the elevations of the rows `upwards` or the given
-/// step.
-void measureGaps(const std::vector<int>& upwards, double given_step_rad, BeamGrid* grid) {
-  std::vector<float> gaps;  // from each row to the one above
+/// From each row of a turn to the one above, rad.
+std::vector<float> gapsOf(const std::vector<int>& upwards, const BeamGrid& grid) {
+  std::vector<float> gaps;
   for (std::size_t i = 1; i < upwards.size(); ++i) {
     const int missing = std::max(1, std::abs(upwards[i] - upwards[i - 1]));
     const double gap =
-        grid->rings[upwards[i]].elevation_rad - grid->rings[upwards[i - 1]].elevation_rad;
+        grid.rings[upwards[i]].elevation_rad - grid.rings[upwards[i - 1]].elevation_rad;
     gaps.push_back(static_cast<float>(gap / missing));
   }
-  std::vector<float> values = gaps;
-  grid->vertical_step_rad = given_step_rad > 0.0 ? given_step_rad : median(&values);
-  const auto half_gap = [&](std::size_t k) {
-    return 0.5 * (given_step_rad > 0.0 ? given_step_rad : static_cast<double>(gaps[k]));
-  };
-  for (std::size_t i = 0; i < upwards.size(); ++i) {
-    BeamGrid::Ring& ring = grid->rings[upwards[i]];
-    const bool lowest = i == 0, highest = i + 1 == upwards.size();
-    if (lowest && highest) {
-      ring.half_up_rad = ring.half_down_rad = 0.5 * grid->vertical_step_rad;
-    } else {
-      ring.half_up_rad = half_gap(highest ? i - 1 : i);
-      ring.half_down_rad = half_gap(lowest ? 0 : i - 1);
+  return gaps;
+}
+
+/// Half-way up and down to the next rings, from their elevations or the given step.
+void measureGaps(const std::vector<std::vector<int>>& turns, double given_step_rad,
+                 BeamGrid* grid) {
+  std::vector<float> all;
+  for (const std::vector<int>& upwards : turns) {
+    const std::vector<float> gaps = gapsOf(upwards, *grid);
+    all.insert(all.end(), gaps.begin(), gaps.end());
+  }
+  grid->vertical_step_rad = given_step_rad > 0.0 ? given_step_rad : median(&all);
+  for (const std::vector<int>& upwards : turns) {
+    const std::vector<float> gaps = gapsOf(upwards, *grid);
+    const auto half_gap = [&](std::size_t k) {
+      return 0.5 * (given_step_rad > 0.0 ? given_step_rad : static_cast<double>(gaps[k]));
+    };
+    for (std::size_t i = 0; i < upwards.size(); ++i) {
+      BeamGrid::Ring& ring = grid->rings[upwards[i]];
+      const bool lowest = i == 0, highest = i + 1 == upwards.size();
+      if (lowest && highest) {
+        ring.half_up_rad = ring.half_down_rad = 0.5 * grid->vertical_step_rad;
+      } else {
+        ring.half_up_rad = half_gap(highest ? i - 1 : i);
+        ring.half_down_rad = half_gap(lowest ? 0 : i - 1);
+      }
     }
   }
 }
 
+/// Mean angle to the nearest return of scattered ones, of which there is one in a square of the
+/// rows' height: half of that height (Clark and Evans, 1954).
+double nearestNeighbour(const RangeImage& image) { return 0.5 * image.step_rad; }
+
 }  // namespace
 
-std::vector<int> rowsUpwards(const RangeImage& image, const BeamGrid& grid) {
-  std::vector<int> rows;
+std::vector<std::vector<int>> rowsUpwards(const RangeImage& image, const BeamGrid& grid) {
+  std::vector<std::vector<int>> turns(static_cast<std::size_t>(image.turns));
+  const int rows_of_turn = image.rows() / image.turns;
   for (int row = 0; row < image.rows(); ++row) {
-    if (image.count(row) > 0) rows.push_back(row);
+    if (image.count(row) > 0) turns[static_cast<std::size_t>(row / rows_of_turn)].push_back(row);
   }
-  std::stable_sort(rows.begin(), rows.end(), [&](int a, int b) {
-    return grid.rings[a].elevation_rad < grid.rings[b].elevation_rad;
-  });
-  return rows;
+  for (std::vector<int>& rows : turns) {
+    std::stable_sort(rows.begin(), rows.end(), [&](int a, int b) {
+      return grid.rings[a].elevation_rad < grid.rings[b].elevation_rad;
+    });
+  }
+  return turns;
 }
 
 void measureSteps(const RangeImage& image, const OcclusionConfig& config, ThreadPool* pool,
                   BeamGrid* grid) {
   grid->rings.assign(static_cast<std::size_t>(image.rows()), {});
   std::vector<float> steps_of_short_rows = measureRows(image, pool, grid);
-  const std::vector<int> upwards = rowsUpwards(image, *grid);
-  if (upwards.empty()) return;
+  if (image.index.empty()) return;
 
   std::vector<float> steps_of_rings;
   for (const BeamGrid::Ring& ring : grid->rings) {
@@ -145,17 +163,20 @@ void measureSteps(const RangeImage& image, const OcclusionConfig& config, Thread
       steps_of_rings.push_back(static_cast<float>(2.0 * ring.half_azimuth_rad));
     }
   }
-  const bool given = config.horizontal_step_deg > 0.0;
-  grid->horizontal_step_rad = given                    ? radians(config.horizontal_step_deg)
+  const double given = config.horizontal_step_deg > 0.0 ? radians(config.horizontal_step_deg)
+                       : image.scattered                ? nearestNeighbour(image)
+                                                        : 0.0;
+  grid->horizontal_step_rad = given > 0.0              ? given
                               : steps_of_rings.empty() ? azimuthStep(&steps_of_short_rows)
                                                        : median(&steps_of_rings);
-  for (const int row : upwards) {
+  for (int row = 0; row < image.rows(); ++row) {
     BeamGrid::Ring& ring = grid->rings[row];
-    if (given || ring.half_azimuth_rad <= 0.0) {
+    if (image.count(row) > 0 && (given > 0.0 || ring.half_azimuth_rad <= 0.0)) {
       ring.half_azimuth_rad = 0.5 * grid->horizontal_step_rad;
     }
   }
-  measureGaps(upwards, radians(config.vertical_step_deg), grid);
+  measureGaps(rowsUpwards(image, *grid),
+              image.scattered ? nearestNeighbour(image) : radians(config.vertical_step_deg), grid);
 }
 
 }  // namespace semantic_lidar_fusion

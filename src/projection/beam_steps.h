@@ -12,7 +12,8 @@ namespace semantic_lidar_fusion {
 void measureSteps(const RangeImage& image, const OcclusionConfig& config, ThreadPool* pool,
                   BeamGrid* grid);
 
-/// The rows with returns, by elevation; ring numbers of some drivers are not in that order.
-std::vector<int> rowsUpwards(const RangeImage& image, const BeamGrid& grid);
+/// For each turn its rows with returns, by elevation; ring numbers of some drivers are not in that
+/// order.
+std::vector<std::vector<int>> rowsUpwards(const RangeImage& image, const BeamGrid& grid);
 
 }  // namespace semantic_lidar_fusion

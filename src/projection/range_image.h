@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <string>
 #include <vector>
 
 #include "semantic_lidar_fusion/common/point_cloud.h"
@@ -24,6 +25,10 @@ struct RangeImage {
   std::vector<std::uint32_t> index;      ///< into the cloud
   std::vector<std::uint32_t> row_begin;  ///< places, one more than rows
   std::vector<std::uint16_t> row_of;     ///< by cloud index; kNoRing = not used
+  int turns = 1;                         ///< each has rows() / turns rows, one after the other
+  double step_rad = 0;                   ///< height of rows that were cut by angle; 0: of others
+  bool scattered = false;                ///< no pattern in azimuth either: steps of step_rad there
+  std::string note;                      ///< what to tell a user; mostly empty
 
   int rows() const { return static_cast<int>(row_begin.size()) - 1; }
   std::uint32_t count(int row) const { return row_begin[row + 1] - row_begin[row]; }
@@ -31,9 +36,11 @@ struct RangeImage {
   float elevation(std::uint32_t place) const;
 };
 
-/// Points without odometry and those in the lidar's origin are left out. The rows are the rings; a
-/// cloud without rings is cut at every `vertical_step_deg` of elevation. Throws DataError when
-/// neither is there. The result does not depend on `pool`.
+/// Points without odometry and those in the lidar's origin are left out. The rows are the rings of
+/// each turn. A cloud without rings, or whose rings are no cones, is cut by elevation at every
+/// `vertical_step_deg`, or else as finely as its points are dense. Throws DataError where a mode of
+/// occlusion needs rings and neither they nor that step are there. The result does not depend on
+/// `pool`.
 RangeImage rangeImage(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool);
 
 }  // namespace semantic_lidar_fusion

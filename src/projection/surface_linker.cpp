@@ -69,7 +69,13 @@ class Linker {
   void link(ThreadPool* pool) {
     near_.assign(image_.index.size(), {kNone, kNone, kNone, kNone});
     links_ = near_;
-    const std::vector<int> rows = rowsUpwards(image_, grid_);
+    for (const std::vector<int>& rows : rowsUpwards(image_, grid_)) linkTurn(rows, pool);
+  }
+
+  std::vector<Links> takeLinks() { return std::move(links_); }
+
+ private:
+  void linkTurn(const std::vector<int>& rows, ThreadPool* pool) {
     const auto count = static_cast<int>(rows.size());
     forEach(pool, count, [&](int k) {
       findBeside(rows[k]);
@@ -94,11 +100,9 @@ class Linker {
     });
   }
 
-  std::vector<Links> takeLinks() { return std::move(links_); }
-
- private:
   float stepOf(int row) const {
-    return static_cast<float>(2.0 * grid_.rings[row].half_azimuth_rad);
+    return static_cast<float>(image_.scattered ? image_.step_rad
+                                               : 2.0 * grid_.rings[row].half_azimuth_rad);
   }
 
   /// Difference of azimuths counter-clockwise, 0..2 pi.

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <cstdint>
+#include <string>
 #include <vector>
 
 #include "semantic_lidar_fusion/common/point_cloud.h"
@@ -27,20 +28,31 @@ struct BeamGrid {
   };
   static constexpr std::int32_t kNoLink = -1;
 
-  /// By ring number; of rings without points all zero. Empty where only the steps are needed and
-  /// `config` gives both.
+  /// By row. The rows of a turn are its rings, by number; each further turn of the lidar in the
+  /// scan has rows of its own. All zero for rows without points. Empty where only the steps are
+  /// needed and `config` gives both.
   std::vector<Ring> rings;
   double vertical_step_rad = 0;  ///< median over rings
   double horizontal_step_rad = 0;
-  /// Of modes that need links, by cloud index: the ring (a made-up one if the cloud has none;
-  /// kNoRing for points that cast no mask) and the links.
+  /// Where links are wanted, by cloud index: the row (kNoRing for points that cast no mask) and the
+  /// links.
   std::vector<std::uint16_t> ring;
   std::vector<Links> links;
+  std::string note;  ///< what to tell a user, once; mostly empty
 };
 
+/// A scan of several turns of the lidar (more than a turn and a quarter, or a part of a turn again)
+/// is taken turn by turn. Rings in which neighbours differ in elevation (rosette patterns, whose
+/// field counts lasers) are none: rows of equal height then serve instead, as high as the points
+/// are dense, and `note` says so.
+///
 /// Steps given in `config` override the data. Throws DataError when the vertical step is needed and
 /// neither the cloud (no ring field) nor `config` gives it. The rings are shared out among the
 /// threads of `pool`, if there is one; the result does not depend on it.
-BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool = nullptr);
+///
+/// `with_links`: make the links even if the mode needs none; a cloud without rings then needs no
+/// step.
+BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool* pool = nullptr,
+                  bool with_links = false);
 
 }  // namespace semantic_lidar_fusion
