@@ -265,6 +265,11 @@ class ProjectionNodelet : public FusionNodelet {
       return camera->overlay.getNumSubscribers() > 0;
     });
     const FusionResult result = pipeline_->fuse(cloud, std::move(views), drawn);
+    if (!result.note.empty() && result.note != told_note_) {
+      told_note_ = result.note;
+      health().set("lidar", result.note);
+      NODELET_WARN_STREAM(result.note);
+    }
     countPoints(result.cloud);
     publish(output_, semanticCloudMessage(result.cloud, rig().classes));
     if (drawn) publishOverlays(scan, result);
@@ -351,6 +356,7 @@ class ProjectionNodelet : public FusionNodelet {
   std::unique_ptr<EpochMonitor> epochs_;
   std::vector<std::unique_ptr<Camera>> cameras_;
   ros::Publisher output_, class_info_;
+  std::string told_note_;  ///< of the lidar's beams
   ros::Subscriber cloud_subscriber_, reference_subscriber_;
 };
 

@@ -402,6 +402,15 @@ OcclusionConfig readOcclusion(YamlSection section) {
   return occlusion;
 }
 
+SmoothingConfig readSmoothing(YamlSection section) {
+  SmoothingConfig smoothing;
+  section.integer("iterations", &smoothing.iterations, 0, SmoothingConfig::kMostIterations);
+  section.number("distance_m", &smoothing.distance_m, {0, 100, true});
+  section.number("intensity", &smoothing.intensity, {0, 1000});
+  section.finish();
+  return smoothing;
+}
+
 Rig readRig(const YAML::Node& root, const std::string& base_directory,
             const std::string& source_name, Problems* problems) {
   Rig rig;
@@ -441,7 +450,9 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
                               {{"mean", OverlapRule::kMean},
                                {"product", OverlapRule::kProduct},
                                {"nearest_in_time", OverlapRule::kNearestInTime},
-                               {"most_central", OverlapRule::kMostCentral}});
+                               {"most_central", OverlapRule::kMostCentral},
+                               {"geometric_mean", OverlapRule::kGeometricMean}});
+  rig.smoothing = readSmoothing(section.child("smoothing"));
   section.boolean("keep_unlabelled", &rig.keep_unlabelled);
   section.integer("threads", &rig.threads, 1, ThreadPool::kMaxThreads);
   section.finish();

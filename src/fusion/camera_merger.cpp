@@ -78,11 +78,13 @@ void mean(const PointVotes& point, int class_count, double* out) {
   }
 }
 
-void product(const PointVotes& point, int class_count, double* out) {
+/// The product of the distributions, each to the power `exponent`, normalised.
+void product(const PointVotes& point, int class_count, double exponent, double* out) {
   double largest = -std::numeric_limits<double>::infinity();
   for (int c = 0; c < class_count; ++c) {
     out[c] = 0;
     for (int k = 0; k < point.count; ++k) out[c] += std::log(point.votes[k].probabilities[c]);
+    out[c] *= exponent;
     largest = std::max(largest, out[c]);
   }
   if (!(largest > -std::numeric_limits<double>::infinity())) {
@@ -150,7 +152,9 @@ void mergeRange(const std::vector<CameraVotes>& votes, OverlapRule rule, std::si
     const double* distribution = point.votes[0].probabilities;
     if (point.count > 1) {
       if (rule == OverlapRule::kProduct) {
-        product(point, class_count, merged.data());
+        product(point, class_count, 1.0, merged.data());
+      } else if (rule == OverlapRule::kGeometricMean) {
+        product(point, class_count, 1.0 / point.count, merged.data());
       } else {
         mean(point, class_count, merged.data());
       }

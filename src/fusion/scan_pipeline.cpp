@@ -63,6 +63,7 @@ FusionConfig fusionConfig(const Rig& rig) {
   config.uncertainty = rig.uncertainty;
   config.occlusion = rig.occlusion;
   config.overlap = rig.overlap;
+  config.smoothing = rig.smoothing;
   config.keep_unlabelled = rig.keep_unlabelled;
   config.threads = rig.threads;
   return config;

@@ -41,6 +41,13 @@ void checkConfig(const FusionConfig& config) {
   nonNegative("occlusion.horizontal_step_deg", config.occlusion.horizontal_step_deg);
   nonNegative("occlusion.depth_margin_m", config.occlusion.depth_margin_m);
   nonNegative("occlusion.depth_margin_ratio", config.occlusion.depth_margin_ratio);
+  const SmoothingConfig& smoothing = config.smoothing;
+  require(smoothing.iterations >= 0 && smoothing.iterations <= SmoothingConfig::kMostIterations,
+          "smoothing.iterations", smoothing.iterations,
+          "in 0.." + std::to_string(SmoothingConfig::kMostIterations));
+  require(std::isfinite(smoothing.distance_m) && smoothing.distance_m > 0, "smoothing.distance_m",
+          smoothing.distance_m, "finite and above 0");
+  nonNegative("smoothing.intensity", smoothing.intensity);
   require(config.threads >= 1 && config.threads <= ThreadPool::kMaxThreads, "threads",
           config.threads, "in 1.." + std::to_string(ThreadPool::kMaxThreads));
   if (!problems.empty()) throw ConfigError(problems);
@@ -413,7 +420,10 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
     return view.has_image && view.model;
   });
   BeamGrid grid;
-  if (any_image && !cloud.empty()) grid = beamGrid(cloud, config_.occlusion, pool_.get());
+  if (any_image && !cloud.empty()) {
+    grid = beamGrid(cloud, config_.occlusion, pool_.get(), config_.smoothing.iterations > 0);
+  }
+  result.note = grid.note;
 
   std::vector<CameraOutcome> outcomes(views.size());
   pool_->forEach(static_cast<int>(views.size()), [&](int camera) {
@@ -442,6 +452,7 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
     votes.push_back(std::move(outcome.votes));
   }
   mergeVotes(votes, config_.overlap, &result.cloud, pool_.get());
+  if (any_image) smoothAlongSurfaces(grid, config_.smoothing, &result.cloud, pool_.get());
 
   for (std::size_t k = 0; k < views.size(); ++k) {
     CameraFusionReport& report = outcomes[k].report;

@@ -150,7 +150,9 @@ class RandomDrive:
                 "exponent": self._pick(2.0, 0.0, 1.0, 3.5),
             },
             "occlusion": occlusion,
-            "overlap": self._pick("mean", "product", "nearest_in_time", "most_central"),
+            "overlap": self._pick(
+                "mean", "product", "nearest_in_time", "most_central", "geometric_mean"
+            ),
             "keep_unlabelled": self._chance(0.85),
         }
 

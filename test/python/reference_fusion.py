@@ -367,9 +367,11 @@ def merged(votes: List[Vote], rule: str) -> Tuple[np.ndarray, int]:
     if rule == "most_central":
         votes = [min(votes, key=lambda v: v.theta)]
     bits = sum(1 << v.bit for v in votes)
-    if rule == "product" and len(votes) > 1:
+    if rule in ("product", "geometric_mean") and len(votes) > 1:
         with np.errstate(divide="ignore"):
             logs = sum(np.log(v.p) for v in votes)
+        if rule == "geometric_mean":
+            logs = logs / len(votes)
         if np.isfinite(logs.max()):  # else they contradict each other fully: the mean
             p = np.exp(logs - logs.max())
             return p / p.sum(), bits

@@ -17,6 +17,7 @@
 #include "semantic_lidar_fusion/lidar/point_cloud_reader.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
 #include "semantic_lidar_fusion/projection/occlusion_config.h"
+#include "semantic_lidar_fusion/smoothing/surface_smoother.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 
@@ -118,6 +119,7 @@ struct Rig {
   SegmentationConfig segmentation;
   OcclusionConfig occlusion;
   OverlapRule overlap = OverlapRule::kMean;
+  SmoothingConfig smoothing;
   bool keep_unlabelled = true;
   int threads = 1;  ///< that share the cameras of a scan; results do not depend on it
 

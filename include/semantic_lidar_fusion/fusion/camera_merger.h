@@ -27,7 +27,8 @@ struct CameraVotes {
 /// `cloud`: points and class_count are given, the other arrays are made here. `votes` are in order
 /// of camera name: sums run in that order, in double.
 ///
-/// A point with one vote keeps it as it is. `kProduct` is formed in log space; where the cameras
+/// A point with one vote keeps it as it is. `kProduct` and `kGeometricMean` are formed in log
+/// space; where the cameras
 /// contradict each other fully (every class has a zero from some camera) it falls back to the mean.
 /// The label is the most likely class as published (float), the lowest id on ties; confidence is
 /// its probability, entropy H / ln(class_count) (0 for one class); `cameras` holds the bits of the

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: MIT
-/// The fusion of one scan: projection, occlusion, transfer and merging, camera by camera.
+/// The fusion of one scan: projection, occlusion, transfer and merging, camera by camera, then
+/// smoothing along the lidar's surfaces.
 #pragma once
 
 #include <cstdint>
@@ -12,6 +13,7 @@
 #include "semantic_lidar_fusion/common/point_cloud.h"
 #include "semantic_lidar_fusion/fusion/camera_merger.h"
 #include "semantic_lidar_fusion/projection/occlusion_mask.h"
+#include "semantic_lidar_fusion/smoothing/surface_smoother.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
 
 namespace semantic_lidar_fusion {
@@ -46,6 +48,7 @@ struct FusionConfig {
   UncertaintyConfig uncertainty;
   OcclusionConfig occlusion;
   OverlapRule overlap = OverlapRule::kMean;
+  SmoothingConfig smoothing;
   bool keep_unlabelled = true;  ///< false: only fused points come out, as in the paper
   int threads = 1;              ///< that share the cameras, the caller's included
 };
@@ -65,6 +68,7 @@ struct CameraFusionReport {
 struct FusionResult {
   SemanticCloud cloud;
   std::vector<CameraFusionReport> cameras;  ///< sorted by name
+  std::string note;  ///< what to tell a user of the lidar's beams, once; mostly empty
 };
 
 /// Stateless between scans; `fuse` may run in several threads.

@@ -247,6 +247,9 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
     }
   }
   const FusionResult result = pipeline_.fuse(rigid.cloud, views, options_.all);
+  if (!result.note.empty() && told_notes_.insert(result.note).second && !options_.quiet) {
+    DropLog::note(result.note);
+  }
   const auto compensated = compensatedCloudMessage(rigid.cloud);
   const auto semantic = semanticCloudMessage(result.cloud, rig_.classes);
 

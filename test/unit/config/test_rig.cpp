@@ -70,6 +70,9 @@ TEST(RigTest, EmptyRigHasTheDefaultsOfTheStructs) {
   EXPECT_EQ(rig.occlusion.depth_margin_ratio, 0.10);
   EXPECT_EQ(rig.lidar.without_time, WithoutTime::kInstant);
   EXPECT_EQ(rig.overlap, OverlapRule::kMean);
+  EXPECT_EQ(rig.smoothing.iterations, 0);
+  EXPECT_EQ(rig.smoothing.distance_m, 0.6);
+  EXPECT_EQ(rig.smoothing.intensity, 20.0);
   EXPECT_TRUE(rig.keep_unlabelled);
   EXPECT_EQ(rig.threads, 1);
   EXPECT_EQ(CameraConfig().max_time_difference_s, 0.05);
@@ -118,6 +121,7 @@ segmentation: {model: usyd.yaml, mode: on_request}
 occlusion: {mode: paper, vertical_step_deg: 2, horizontal_step_deg: 0.1, depth_margin_m: 0,
             depth_margin_ratio: 0.2}
 overlap: most_central
+smoothing: {iterations: 4, distance_m: 0.5, intensity: 0}
 keep_unlabelled: false
 threads: 3
 )");
@@ -183,6 +187,9 @@ threads: 3
   EXPECT_EQ(rig.occlusion.depth_margin_m, 0);
   EXPECT_EQ(rig.occlusion.depth_margin_ratio, 0.2);
   EXPECT_EQ(rig.overlap, OverlapRule::kMostCentral);
+  EXPECT_EQ(rig.smoothing.iterations, 4);
+  EXPECT_EQ(rig.smoothing.distance_m, 0.5);
+  EXPECT_EQ(rig.smoothing.intensity, 0.0);
   EXPECT_FALSE(rig.keep_unlabelled);
   EXPECT_EQ(rig.threads, 3);
 
@@ -254,7 +261,12 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
            {"<<: {a: 1}", "rig.yaml: << = (a map of 1): unknown key; known here: name, "},
            {"overlap: last",
             "rig.yaml: overlap = last: must be one of mean, product, "
-            "nearest_in_time, most_central"},
+            "nearest_in_time, most_central, geometric_mean"},
+           {"overlap: geometric", "rig.yaml: overlap = geometric: must be one of mean, product, "},
+           {"smoothing: {iterations: -1}",
+            "rig.yaml: smoothing.iterations = -1: must be a whole number from 0 to 100"},
+           {"smoothing: {distance_m: 0}", "rig.yaml: smoothing.distance_m = 0: must be "},
+           {"smoothing: {intensity: -1}", "rig.yaml: smoothing.intensity = -1: must be "},
            {"overlap: [mean]", "rig.yaml: overlap = (a list of 1): must be one of mean"},
            {"keep_unlabelled: maybe", "rig.yaml: keep_unlabelled = maybe: must be true or false"},
            {"threads: 0", "rig.yaml: threads = 0: must be a whole number from 1 to 64"},
@@ -561,7 +573,7 @@ TEST(ResolvedRig, LoadsAgainAsTheSameRig) {
     EXPECT_EQ(again.yaml, rig.yaml) << file;
     EXPECT_EQ(again.name, rig.name);
     EXPECT_EQ(again.classes.toJson(), rig.classes.toJson());
-    EXPECT_EQ(again.occlusion.mode, OcclusionMode::kOff);
+    EXPECT_EQ(again.occlusion.mode, &OcclusionMode::kOff);
     EXPECT_EQ(again.threads, 2);
     ASSERT_EQ(again.cameras.size(), rig.cameras.size());
     for (std::size_t i = 0; i < rig.cameras.size(); ++i) {

@@ -72,13 +72,16 @@ std::vector<double> mergedReference(const std::vector<const CameraVotes*>& camer
   for (int c = 0; c < class_count; ++c) {
     for (const std::size_t k : used) {
       mean[c] += p(k, c) / static_cast<double>(used.size());
-      product[c] *= p(k, c);
+      product[c] *= rule == OverlapRule::kGeometricMean
+                        ? std::pow(p(k, c), 1.0 / static_cast<double>(used.size()))
+                        : p(k, c);
     }
     product_sum += product[c];
   }
   *bits = 0;
   for (const std::size_t k : used) *bits |= 1u << cameras[k]->rig_index;
-  if (rule != OverlapRule::kProduct || product_sum == 0) return mean;
+  const bool multiplies = rule == OverlapRule::kProduct || rule == OverlapRule::kGeometricMean;
+  if (!multiplies || product_sum == 0) return mean;
   for (double& value : product) value /= product_sum;
   return product;
 }
@@ -143,7 +146,8 @@ TEST_P(AllRules, EqualTheReferenceOnRandomVotes) {
 
 INSTANTIATE_TEST_SUITE_P(CameraMerger, AllRules,
                          ::testing::Values(OverlapRule::kMean, OverlapRule::kProduct,
-                                           OverlapRule::kNearestInTime, OverlapRule::kMostCentral));
+                                           OverlapRule::kNearestInTime, OverlapRule::kMostCentral,
+                                           OverlapRule::kGeometricMean));
 
 /// Two cameras (rig 1 and 3) that both see point 0.
 SemanticCloud mergeTwo(const std::vector<double>& a, const std::vector<double>& b, OverlapRule rule,
@@ -174,6 +178,18 @@ TEST(CameraMerger, MultipliesByHand) {
   EXPECT_NEAR(cloud.probabilities[0], 0.4, 1e-7);
   EXPECT_NEAR(cloud.probabilities[1], 0.4, 1e-7);
   EXPECT_NEAR(cloud.probabilities[2], 0.2, 1e-7);
+}
+
+TEST(CameraMerger, TakesTheGeometricMeanByHand) {
+  // sqrt(0.5 * 0.125) : sqrt(0.25 * 0.25) : sqrt(0.25 * 0.625), and twice the same is the same.
+  const SemanticCloud cloud =
+      mergeTwo({0.5, 0.25, 0.25}, {0.125, 0.25, 0.625}, OverlapRule::kGeometricMean);
+  const double sum = 0.25 + 0.25 + std::sqrt(0.15625);
+  EXPECT_NEAR(cloud.probabilities[0], 0.25 / sum, 1e-7);
+  EXPECT_NEAR(cloud.probabilities[1], 0.25 / sum, 1e-7);
+  EXPECT_NEAR(cloud.probabilities[2], std::sqrt(0.15625) / sum, 1e-7);
+  const std::vector<double> p{0.7, 0.2, 0.1};
+  EXPECT_NEAR(mergeTwo(p, p, OverlapRule::kGeometricMean).probabilities[0], 0.7, 1e-7);
 }
 
 TEST(CameraMerger, TakesTheNearestInTimeOrTheMostCentralOnly) {
