@@ -125,7 +125,7 @@ if [ -n "$drive" ]; then
 else
   rig=$source_dir/config/demo.yaml
   simulator=$build_dir/install/lib/$package/simulate_drive
-  [ -x "$simulator" ] || fail "the simulator is not built: install libembree-dev (Embree 3) and try again"
+  [ -x "$simulator" ] || fail "the simulator is not built: install libembree-dev and try again"
   step "simulate a drive of $duration s, images at $scale of 1920 x 1208"
   logged "$output/simulate.log" "$simulator" --out "$output/drive.bag" --duration "$duration" --scale "$scale" \
     --threads "$jobs" --force

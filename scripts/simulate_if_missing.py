@@ -32,7 +32,7 @@ def main():
         if not os.access(options.simulator, os.X_OK):
             raise DataError(
                 "%s: no such bag, and simulate_drive, which would make it, is not built: that needs "
-                "Embree 3" % options.bag
+                "Embree" % options.bag
             )
         print("making %s, which takes a minute or more" % os.path.abspath(options.bag))
         sys.stdout.flush()

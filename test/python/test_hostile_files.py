@@ -25,7 +25,7 @@ needs_fuse_bag = pytest.mark.skipif(
 )
 needs_simulator = pytest.mark.skipif(
     not os.access(os.path.join(BIN_DIR, "simulate_drive"), os.X_OK),
-    reason="simulate_drive is not built (Embree 3 is absent)",
+    reason="simulate_drive is not built (Embree is absent)",
 )
 
 

@@ -14,7 +14,7 @@ from semantic_lidar_fusion.bags import cloud_io  # noqa: E402
 
 PROGRAM = os.path.join(os.environ.get("SLF_BIN_DIR", ""), "simulate_drive")
 pytestmark = pytest.mark.skipif(
-    not os.access(PROGRAM, os.X_OK), reason="simulate_drive is not built (Embree 3 is absent)"
+    not os.access(PROGRAM, os.X_OK), reason="simulate_drive is not built (Embree is absent)"
 )
 
 CAMERAS = ("A0", "A1", "A2", "B0", "B1")

@@ -17,7 +17,7 @@ BIN_DIR = os.environ.get("SLF_BIN_DIR", "")
 PROGRAMS = [os.path.join(BIN_DIR, name) for name in ("simulate_drive", "fuse_bag")]
 pytestmark = pytest.mark.skipif(
     not all(os.access(program, os.X_OK) for program in PROGRAMS),
-    reason="simulate_drive or fuse_bag is not built (Embree 3 is absent)",
+    reason="simulate_drive or fuse_bag is not built (Embree is absent)",
 )
 RIG = os.path.join(SOURCE_DIR, "config", "demo.yaml")
 

@@ -33,7 +33,7 @@ def run(program, *arguments):
 class Demo(live.ReplayCase):
     def test_demo_evaluates_what_it_shows(self):
         if not os.path.exists(os.path.join(os.environ["SLF_BIN_DIR"], "simulate_drive")):
-            self.skipTest("simulate_drive is not built: it needs Embree 3")
+            self.skipTest("simulate_drive is not built: it needs Embree")
         with live.folder() as path:
             bag, recorded = os.path.join(path, "drive.bag"), os.path.join(path, "live.bag")
             online, offline = os.path.join(path, "online"), os.path.join(path, "offline")

@@ -5,7 +5,7 @@
 set -euo pipefail
 source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 if [ ! -x "$SLF_BIN_DIR/simulate_drive" ]; then
-  echo "simulate_drive is not built (Embree 3 is absent)"
+  echo "simulate_drive is not built (Embree is absent)"
   exit 77
 fi
 exec "$source_dir/scripts/soak.sh" "${SLF_SOAK_MINUTES:-0.8}" --warm-up 0.4 --scale 0.25 --duration 2 \

@@ -263,9 +263,7 @@ Hit World::cast(const Eigen::Vector3d& origin, const Eigen::Vector3d& direction,
   const double fraction = (time_s - sweep_first_s_) / (sweep_last_s_ - sweep_first_s_);
   RTCRayHit ray = makeRay(origin.cast<float>(), way,
                           static_cast<float>(std::min(std::max(fraction, 0.0), 1.0)));
-  RTCIntersectContext context;
-  rtcInitIntersectContext(&context);
-  rtcIntersect1(sweep_, &context, &ray);
+  intersectRay(sweep_, false, &ray);
   if (ray.hit.geomID == RTC_INVALID_GEOMETRY_ID) return {};
   const Object& object = objects_[ray.hit.instID[0]];
   return hitOf(ray, object.motion(time_s).linear().cast<float>(), way);
@@ -273,10 +271,7 @@ Hit World::cast(const Eigen::Vector3d& origin, const Eigen::Vector3d& direction,
 
 Hit World::see(const Eigen::Vector3f& origin, const Eigen::Vector3f& direction) const {
   RTCRayHit ray = makeRay(origin, direction, 0.0F);
-  RTCIntersectContext context;
-  rtcInitIntersectContext(&context);
-  context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
-  rtcIntersect1(instant_, &context, &ray);
+  intersectRay(instant_, true, &ray);
   if (ray.hit.geomID == RTC_INVALID_GEOMETRY_ID) return {};
   return hitOf(ray, objects_[ray.hit.instID[0]].T_object_world.linear().transpose(), direction);
 }
@@ -286,10 +281,7 @@ bool World::blocked(const Eigen::Vector3f& origin, const Eigen::Vector3f& direct
   RTCRay ray = makeRay(origin, direction, 0.0F).ray;
   ray.tnear = nearest;
   ray.tfar = farthest;
-  RTCIntersectContext context;
-  rtcInitIntersectContext(&context);
-  rtcOccluded1(instant_, &context, &ray);
-  return ray.tfar < 0.0F;
+  return occludedRay(instant_, &ray);
 }
 
 Class World::classOf(const Hit& hit) const {

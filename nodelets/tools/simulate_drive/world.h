@@ -2,8 +2,6 @@
 /// A world of meshes, some of which move, and rays through it at any time.
 #pragma once
 
-#include <embree3/rtcore.h>
-
 #include <Eigen/Geometry>
 #include <cstdint>
 #include <functional>
@@ -11,6 +9,7 @@
 #include <vector>
 
 #include "semantic_lidar_fusion/common/types.h"
+#include "tools/simulate_drive/embree.h"
 
 namespace semantic_lidar_fusion {
 namespace simulator {
