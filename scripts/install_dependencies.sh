@@ -9,6 +9,9 @@
 set -euo pipefail
 PATH=/usr/sbin:/usr/bin:/sbin:/bin
 
+source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+formatters=$source_dir/test/lint/formatters.txt
+
 testing=1
 for option in "$@"; do
   case $option in
@@ -51,14 +54,28 @@ else
 fi
 # ... oracles and peers in tests and benchmarks, the format checks, the fuzzers.
 if [ "$testing" = 1 ]; then
-  optional="$optional libopencv-contrib-dev clang-format black libbenchmark-dev pcl-tools
-    octomap-tools clang libclang-rt-14-dev"
+  optional="$optional libopencv-contrib-dev libbenchmark-dev pcl-tools octomap-tools clang
+    python3-venv"
   if [ -d /opt/ros/noetic ]; then
     optional="$optional ros-noetic-pcl-ros"
   else
     optional="$optional libpcl-ros-dev"
   fi
 fi
+
+# Of what follows the release's own versions, known only when the package lists are there: the
+# sanitizers' and fuzzers' runtime of its clang, and a formatter where it is the version in which
+# this package's files are kept.
+candidate() { apt-cache policy "$1" 2>/dev/null | sed -n 's/^ *Candidate: \([0-9]*:\)\?//p'; }
+versioned() {
+  [ "$testing" = 1 ] || return 0
+  local clang name version
+  clang=$(candidate clang)
+  [ -z "$clang" ] || echo "libclang-rt-${clang%%.*}-dev"
+  while IFS='=' read -r name _ version; do
+    case $(candidate "$name") in "${version%%.*}".*) echo "$name" ;; esac
+  done <"$formatters"
+}
 
 installed() { [ "$(dpkg-query -W -f='${db:Status-Status}' "$1" 2>/dev/null)" = installed ]; }
 offered() { apt-cache show "$1" >/dev/null 2>&1; }
@@ -92,12 +109,33 @@ if ! getent ahosts localhost >/dev/null; then
   fi
 fi
 
-missing=$(missing_of $required)
-extra=$(missing_of $optional)
-if [ -z "$missing$extra" ]; then
-  say "nothing is missing"
+# Formatters that the release has in other versions come from PyPI, into a folder of their own.
+has_formatter() {
+  local tool
+  for tool in "$source_dir/.tools/bin/$1" "$1"; do
+    ! "$tool" --version 2>/dev/null | grep -q "[ v]${2%%.*}\." || return 0
+  done
+  return 1
+}
+finish() {
+  local name version wanted=""
+  while IFS='=' read -r name _ version; do
+    has_formatter "$name" "$version" || wanted="$wanted $name==$version"
+  done <"$formatters"
+  if [ "$testing" = 1 ] && [ -n "$wanted" ] && installed python3-venv; then
+    say "installing$wanted into .tools"
+    if ! { python3 -m venv "$source_dir/.tools" &&
+      "$source_dir/.tools/bin/pip" install --quiet $wanted; } >/dev/null 2>&1; then
+      say "going on without$wanted"
+    fi
+  fi
+  say "$1"
   exit 0
-fi
+}
+
+missing=$(missing_of $required)
+extra=$(missing_of $optional $(versioned))
+[ -n "$missing$extra" ] || finish "nothing is missing"
 
 as_root() { "$@"; }
 if [ "$(id -u)" -ne 0 ]; then
@@ -125,8 +163,7 @@ offered_of() {
 }
 lists() { ls /var/lib/apt/lists/*Packages* 2>/dev/null; }
 if [ -z "$missing" ] && [ -n "$(lists)" ] && [ -z "$(offered_of $extra)" ]; then
-  say "nothing is missing that this release has"
-  exit 0
+  finish "nothing is missing that this release has"
 fi
 
 say "updating the package lists"
@@ -145,9 +182,9 @@ if [ -n "$missing" ]; then
   say "installing" $missing
   apt install -y --no-install-recommends $missing
 fi
-extra=$(offered_of $extra)
+extra=$(offered_of $(missing_of $optional $(versioned)))
 if [ -n "$extra" ]; then
   say "installing" $extra
   apt install -y --no-install-recommends $extra || say "going on without" $extra
 fi
-say "done"
+finish "done"

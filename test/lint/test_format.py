@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Formatting, licence lines and machine paths of everything that is shipped.
 
-Formatters are compared only in the version whose output is kept here: another one may break lines
-elsewhere."""
+Formatters are compared only in the version whose output is kept here (formatters.txt): another one
+may break lines elsewhere. scripts/install_dependencies.sh puts them into .tools/ where the release
+has others."""
 
 import os
 import re
@@ -12,8 +13,7 @@ import subprocess
 import pytest
 
 SOURCE_DIR = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))
-CLANG_FORMAT_MAJOR = 14
-BLACK_MAJOR = 23
+HERE = os.path.dirname(os.path.abspath(__file__))
 SKIPPED_FOLDERS = re.compile(r"^(build.*|devel|install|data|\..*|__pycache__)$")
 
 
@@ -30,18 +30,25 @@ def sources(*endings):
     return sorted(found)
 
 
-def formatter(program, wanted):
-    """Path of the formatter, or a skip that says why not."""
-    path = shutil.which(program)
-    if not path:
-        pytest.skip("%s is not installed" % program)
-    version = subprocess.run(
-        [path, "--version"], stdout=subprocess.PIPE, check=True
-    ).stdout.decode()
-    major = re.search(r"(\d+)\.\d+", version)
-    if not major or int(major.group(1)) != wanted:
-        pytest.skip("%s is kept in version %d; here is: %s" % (program, wanted, version.strip()))
-    return path
+def major_of(text):
+    found = re.search(r"(\d+)\.\d+", text)
+    return found.group(1) if found else ""
+
+
+def formatter(program):
+    """Path of the formatter in the version that is kept, or a skip that says why not."""
+    with open(os.path.join(HERE, "formatters.txt"), encoding="utf-8") as file:
+        wanted = major_of(dict(line.strip().split("==") for line in file)[program])
+    versions = []
+    own = shutil.which(program, path=os.path.join(SOURCE_DIR, ".tools", "bin"))
+    for path in filter(None, (own, shutil.which(program))):
+        done = subprocess.run([path, "--version"], stdout=subprocess.PIPE)
+        version = done.stdout.decode().strip()
+        if done.returncode == 0 and major_of(version) == wanted:
+            return path
+        versions.append(version)
+    here = ", ".join(versions) or "none"
+    return pytest.skip("%s is kept in version %s; here is: %s" % (program, wanted, here))
 
 
 def run(command):
@@ -50,14 +57,14 @@ def run(command):
 
 
 def test_clang_format():
-    clang_format = formatter("clang-format", CLANG_FORMAT_MAJOR)
+    clang_format = formatter("clang-format")
     files = sources(".h", ".cpp")
     assert files
     run([clang_format, "--dry-run", "-Werror", "--style=file"] + files)
 
 
 def test_black():
-    black = formatter("black", BLACK_MAJOR)
+    black = formatter("black")
     files = sources(".py")
     assert files
     run([black, "--check", "--quiet", "--diff"] + files)
