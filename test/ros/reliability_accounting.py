@@ -174,7 +174,7 @@ class Accounting(Feed):
         self.assertLess(len(received), BURST)
         self.assertLess(took, 30.0)
         self.assertGreaterEqual(len(received), 1)
-        newest = max(read_cloud(m)["dt"].max() + m.header.stamp.to_sec() for m in received)
+        newest = max(float(read_cloud(m)["dt"].max()) + m.header.stamp.to_sec() for m in received)
         self.assertGreater(newest, cloud.header.stamp.to_sec(), "the newest scan was dropped")
         self.said.wait_for(r"messages come faster than they are worked off|a scan is dropped")
         # and then all is well again

@@ -8,13 +8,13 @@
 #include <thread>
 
 #include "semantic_lidar_fusion/common/error.h"
+#include "tools/simulate_drive/materials.h"
 #include "tools/simulate_drive/noise.h"
 
 namespace semantic_lidar_fusion {
 namespace simulator {
 namespace {
 
-using Eigen::Vector2f;
 using Eigen::Vector3f;
 
 const Vector3f kSunDirection = Vector3f(0.35F, -0.62F, 0.70F).normalized();
@@ -22,13 +22,6 @@ const Vector3f kSunLight(1.75F, 1.62F, 1.40F);
 const Vector3f kSkyLight(0.46F, 0.54F, 0.66F);
 const Vector3f kGroundLight(0.22F, 0.20F, 0.18F);
 constexpr float kHazeM = 320.0F;
-
-float smoothStep(float from, float to, float x) {
-  const float t = std::min(std::max((x - from) / (to - from), 0.0F), 1.0F);
-  return t * t * (3.0F - 2.0F * t);
-}
-
-float fraction(float x) { return x - std::floor(x); }
 
 Vector3f skyColor(const Vector3f& way) {
   const float up = std::max(way.z(), 0.0F);
@@ -45,211 +38,6 @@ Vector3f skyColor(const Vector3f& way) {
   sky += Vector3f(1.0F, 0.93F, 0.8F) *
          (0.35F * std::pow(glare, 24.0F) + 6.0F * std::pow(glare, 1800.0F));
   return sky;
-}
-
-/// Joints of stones of a running bond: 1 on the stone, 0 in the joint.
-float bond(float along, float up, float length, float height, float joint, float* id_x,
-           float* id_y) {
-  const float row = std::floor(up / height);
-  const float shifted = along / length + (std::fmod(std::abs(row), 2.0F) < 0.5F ? 0.0F : 0.5F);
-  *id_x = std::floor(shifted);
-  *id_y = row;
-  const float x = (shifted - *id_x) * length, y = up - row * height;
-  const float edge = std::min(std::min(x, length - x), std::min(y, height - y));
-  return smoothStep(0.2F * joint, joint, edge);
-}
-
-struct Surface {
-  Vector3f albedo;
-  float gloss = 0.0F;  ///< of a mirror for the sky
-  float shine = 0.0F;  ///< of the sun's highlight
-  float glow = 0.0F;   ///< own light
-  bool thin = false;   ///< lets light through from behind
-};
-
-/// `p`: object coordinates, `n`: normal in object coordinates, `uv`: texture.
-Surface surfaceOf(Material material, const Vector3f& tint, const Vector3f& p, const Vector3f& n,
-                  const Vector2f& uv, float distance) {
-  Surface s;
-  const float fine = distance < 25.0F ? 1.0F : 25.0F / distance;
-  switch (material) {
-    case Material::kAsphalt: {
-      const float along = uv.x(), across = uv.y();
-      const float grain = smoothNoise(40.0F * along, 40.0F * across, 5) - 0.5F;
-      const float patch = smoothNoise(0.35F * along, 0.8F * across, 6) - 0.5F;
-      const float worn = std::exp(-12.0F * std::pow(std::abs(std::abs(across) - 0.75F), 2.0F));
-      const float repair = smoothNoise(0.12F * along, 0.3F * across, 9) > 0.72F ? -0.045F : 0.0F;
-      const float base = 0.185F + 0.06F * fine * grain + 0.05F * patch + 0.02F * worn + repair;
-      s.albedo = Vector3f(base, base, 1.03F * base);
-      const float wear = smoothNoise(9.0F * along, 9.0F * across, 8);
-      const bool dash = fraction(along / 9.0F) < 0.4F && std::abs(across + 1.75F) < 0.06F;
-      const bool edge = std::abs(across - 1.72F) < 0.05F || std::abs(across + 5.22F) < 0.05F;
-      if ((dash || edge) && wear > 0.22F) s.albedo = Vector3f(0.72F, 0.72F, 0.69F);
-      // The gutter.
-      if (across > 3.5F || across < -7.0F) {
-        s.albedo = Vector3f::Constant(0.34F + 0.05F * fine * grain + 0.03F * patch);
-      }
-      s.shine = 0.06F;
-      break;
-    }
-    case Material::kMarking:
-      s.albedo = Vector3f(0.75F, 0.75F, 0.72F);
-      break;
-    case Material::kPaving: {
-      float ix, iy;
-      const float slab = bond(uv.x(), uv.y(), 0.6F, 0.6F, 0.012F + 0.001F * distance, &ix, &iy);
-      const float shade = latticeNoise(static_cast<int>(ix), static_cast<int>(iy), 11) - 0.5F;
-      const float dirt = smoothNoise(0.9F * uv.x(), 0.9F * uv.y(), 12) - 0.5F;
-      const float grain = smoothNoise(30.0F * uv.x(), 30.0F * uv.y(), 13) - 0.5F;
-      const float base = 0.46F + 0.09F * shade + 0.10F * dirt + 0.05F * fine * grain;
-      s.albedo = Vector3f(1.04F, 1.0F, 0.93F) * base * (1.0F - (1.0F - slab) * 0.55F * fine);
-      break;
-    }
-    case Material::kKerb: {
-      const float joint = fraction(uv.x()) < 0.02F ? 0.6F : 1.0F;
-      s.albedo = Vector3f::Constant(
-          joint * (0.55F + 0.12F * (smoothNoise(7.0F * uv.x(), 7.0F * uv.y(), 14) - 0.5F)));
-      break;
-    }
-    case Material::kGrass: {
-      const float tuft = smoothNoise(14.0F * uv.x(), 14.0F * uv.y(), 15);
-      const float blade = smoothNoise(60.0F * uv.x(), 60.0F * uv.y(), 16);
-      const float dry = smoothNoise(0.4F * uv.x(), 0.4F * uv.y(), 17);
-      const float base = 0.55F + 0.5F * fine * (tuft - 0.5F) + 0.5F * fine * (blade - 0.5F);
-      s.albedo = base * (Vector3f(0.20F, 0.34F, 0.09F) + dry * Vector3f(0.20F, 0.10F, 0.05F));
-      break;
-    }
-    case Material::kBrick:
-    case Material::kPlaster: {
-      const float along = std::abs(n.x()) > 0.7F ? p.y() : p.x(), up = p.z();
-      const float stain = smoothNoise(0.7F * along, 0.35F * up, 18) - 0.5F;
-      if (material == Material::kBrick) {
-        float ix, iy;
-        const float brick = bond(along, up, 0.24F, 0.082F, 0.01F + 0.0012F * distance, &ix, &iy);
-        const float shade = latticeNoise(static_cast<int>(ix), static_cast<int>(iy), 19) - 0.5F;
-        s.albedo = 0.8F * tint * (1.0F + 0.45F * fine * shade + 0.25F * stain);
-        s.albedo += (Vector3f(0.6F, 0.57F, 0.52F) - s.albedo) * (1.0F - brick) * fine;
-      } else {
-        const float rough = smoothNoise(18.0F * along, 18.0F * up, 20) - 0.5F;
-        const float drip = smoothNoise(4.0F * along, 0.5F * up, 21) - 0.5F;
-        s.albedo = 0.85F * tint * (1.0F + 0.22F * stain + 0.10F * fine * rough + 0.08F * drip);
-        if (up < 0.6F) s.albedo *= 0.72F;
-      }
-      break;
-    }
-    case Material::kGlass: {
-      const float x = std::abs(uv.x() - 0.5F), y = std::abs(uv.y() - 0.5F);
-      const bool frame = x > 0.445F || y > 0.455F || x < 0.03F || std::abs(uv.y() - 0.68F) < 0.02F;
-      if (frame) {
-        s.albedo = Vector3f(0.82F, 0.82F, 0.8F);
-      } else {
-        const bool curtain = uv.y() > 0.2F && x > 0.3F + 0.1F * fraction(13.7F * std::floor(p.x()));
-        s.albedo = curtain ? Vector3f(0.42F, 0.40F, 0.36F) : Vector3f(0.05F, 0.06F, 0.07F);
-        s.gloss = 0.30F;
-        s.shine = 0.8F;
-      }
-      break;
-    }
-    case Material::kFrame:
-      s.albedo = Vector3f(0.80F, 0.79F, 0.76F);
-      break;
-    case Material::kRoof: {
-      float ix, iy;
-      const float tile = bond(p.x(), p.y(), 0.3F, 0.33F, 0.03F, &ix, &iy);
-      const float shade = latticeNoise(static_cast<int>(ix), static_cast<int>(iy), 22) - 0.5F;
-      s.albedo = Vector3f(0.42F, 0.22F, 0.16F) * (0.75F + 0.25F * tile + 0.3F * fine * shade);
-      break;
-    }
-    case Material::kDoor: {
-      const bool panel = std::abs(std::abs(uv.x() - 0.5F) - 0.22F) < 0.15F &&
-                         std::abs(fraction(2.0F * uv.y()) - 0.5F) < 0.36F;
-      s.albedo = Vector3f(0.14F, 0.20F, 0.26F) * (panel ? 1.35F : 1.0F);
-      s.shine = 0.1F;
-      break;
-    }
-    case Material::kWood: {
-      const float grain = smoothNoise(25.0F * p.x(), 2.0F * p.z() + 25.0F * p.y(), 24) - 0.5F;
-      s.albedo = tint * (1.0F + 0.3F * grain);
-      break;
-    }
-    case Material::kMetal:
-      s.albedo = tint;
-      s.gloss = 0.05F;
-      s.shine = 0.3F;
-      break;
-    case Material::kConcrete:
-      s.albedo = Vector3f::Constant(
-          0.6F + 0.15F * (smoothNoise(5.0F * p.x(), 5.0F * (p.y() + p.z()), 25) - 0.5F));
-      break;
-    case Material::kBark: {
-      const float ridge = smoothNoise(30.0F * (p.x() + p.y()), 5.0F * p.z(), 26);
-      s.albedo = Vector3f(0.27F, 0.20F, 0.15F) * (0.55F + 0.8F * ridge);
-      break;
-    }
-    case Material::kLeaf: {
-      const float kind =
-          latticeNoise(static_cast<int>(std::floor(7.0F * p.x())),
-                       static_cast<int>(std::floor(7.0F * (p.y() + 2.0F * p.z()))), 27);
-      s.albedo = tint * (0.7F + 0.7F * kind);
-      s.thin = true;
-      s.shine = 0.08F;
-      break;
-    }
-    case Material::kPaint: {
-      // Door seams.
-      const bool seam = p.z() > 0.35F && p.z() < 1.0F &&
-                        (std::abs(p.x() + 0.25F) < 0.008F || std::abs(p.x() - 0.85F) < 0.008F);
-      s.albedo = seam ? Vector3f(0.3F * tint) : tint;
-      s.gloss = 0.10F;
-      s.shine = 1.1F;
-      break;
-    }
-    case Material::kCarGlass:
-      s.albedo = Vector3f(0.03F, 0.035F, 0.04F);
-      s.gloss = 0.28F;
-      s.shine = 1.0F;
-      break;
-    case Material::kRubber:
-      s.albedo = Vector3f(0.045F, 0.045F, 0.05F);
-      break;
-    case Material::kHeadlight:
-      s.albedo = Vector3f(0.75F, 0.76F, 0.78F);
-      s.gloss = 0.2F;
-      break;
-    case Material::kTaillight:
-      s.albedo = Vector3f(0.55F, 0.04F, 0.03F);
-      s.glow = 0.15F;
-      break;
-    case Material::kSkin:
-      s.albedo = Vector3f(0.62F, 0.43F, 0.34F);
-      break;
-    case Material::kCloth: {
-      const float fold = smoothNoise(9.0F * p.x() + 9.0F * p.y(), 7.0F * p.z(), 28) - 0.5F;
-      s.albedo = tint * (1.0F + 0.4F * fold);
-      break;
-    }
-    case Material::kTrousers:
-      s.albedo = 0.25F * tint + Vector3f(0.05F, 0.055F, 0.08F);
-      break;
-    case Material::kHair:
-      s.albedo = Vector3f(0.10F, 0.07F, 0.05F);
-      break;
-    case Material::kSignFace: {
-      const float radius = std::max(uv.norm(), std::max(std::abs(uv.x()), std::abs(uv.y())));
-      const bool bar = std::abs(uv.y()) < 0.14F && std::abs(uv.x()) < 0.45F;
-      s.albedo = radius > 0.74F || uv.isZero(0.0F) ? Vector3f(0.66F, 0.06F, 0.05F)
-                 : bar                             ? Vector3f(0.06F, 0.06F, 0.07F)
-                                                   : Vector3f(0.85F, 0.85F, 0.84F);
-      s.glow = 0.1F;
-      break;
-    }
-    case Material::kBin:
-      s.albedo = tint;
-      s.shine = 0.1F;
-      break;
-  }
-  s.albedo = s.albedo.cwiseMax(0.01F).cwiseMin(0.95F);
-  return s;
 }
 
 struct Sample {
@@ -273,8 +61,9 @@ Sample look(const World& world, const Vector3f& origin, const Vector3f& way) {
   sample.range = hit.range;
   const Vector3f p = origin + hit.range * way;
   const Surface surface =
-      surfaceOf(world.materialOf(hit), world.tintOf(hit), world.toObjectNow(hit.object, p),
-                world.normalToObjectNow(hit.object, hit.normal), world.textureOf(hit), hit.range);
+      surfaceOf(world.materialOf(hit),
+                {world.tintOf(hit), world.toObjectNow(hit.object, p),
+                 world.normalToObjectNow(hit.object, hit.normal), world.textureOf(hit), hit.range});
   const Vector3f& n = hit.normal;
   float facing = n.dot(kSunDirection);
   if (surface.thin) facing = facing > 0.0F ? 0.35F + 0.65F * facing : -0.55F * facing + 0.2F;
@@ -423,42 +212,6 @@ cv::Mat distanceToClassEdge(const cv::Mat& labels) {
     distance.copyTo(result, inside);
   }
   return result;
-}
-
-LidarResponse lidarResponse(Material material, const Eigen::Vector3f& tint) {
-  switch (material) {
-    case Material::kAsphalt:
-      return {0.17F, 0.0F};
-    case Material::kMarking:
-      return {0.6F, 0.0F};
-    case Material::kPaving:
-    case Material::kKerb:
-    case Material::kConcrete:
-      return {0.4F, 0.0F};
-    case Material::kGrass:
-    case Material::kLeaf:
-      return {0.45F, 0.03F};
-    case Material::kBark:
-    case Material::kWood:
-      return {0.4F, 0.0F};
-    case Material::kGlass:
-      return {0.25F, 0.55F};
-    case Material::kCarGlass:
-      return {0.2F, 0.7F};
-    case Material::kPaint:
-      return {0.12F + 0.5F * tint.mean(), 0.04F};
-    case Material::kRubber:
-    case Material::kHair:
-      return {0.08F, 0.02F};
-    case Material::kMetal:
-      return {0.35F, 0.01F};
-    case Material::kHeadlight:
-    case Material::kTaillight:
-    case Material::kSignFace:
-      return {1.0F, 0.0F};
-    default:
-      return {0.15F + 0.4F * tint.mean(), 0.0F};
-  }
 }
 
 }  // namespace simulator

@@ -41,13 +41,5 @@ class Camera {
 /// nearest pixel of another class. CV_32FC1; at most the image's diagonal.
 cv::Mat distanceToClassEdge(const cv::Mat& labels);
 
-/// What a lidar sees of a material: the share of light that comes back, and the share of pulses
-/// that are lost in glass and the like.
-struct LidarResponse {
-  float reflectivity = 0.3F;
-  float lost = 0.0F;
-};
-LidarResponse lidarResponse(Material material, const Eigen::Vector3f& tint);
-
 }  // namespace simulator
 }  // namespace semantic_lidar_fusion

@@ -6,7 +6,7 @@
 #include <thread>
 
 #include "semantic_lidar_fusion/lidar/firing_times.h"
-#include "tools/simulate_drive/camera.h"
+#include "tools/simulate_drive/materials.h"
 #include "tools/simulate_drive/noise.h"
 
 namespace semantic_lidar_fusion {

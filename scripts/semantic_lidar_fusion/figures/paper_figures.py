@@ -298,7 +298,7 @@ def draw_uncertainty(path: str, view: View, labels: LabelSet) -> None:
         axis.set_xlabel(name)
         _bare(axis)
     last = axes.flat[3]
-    low = min(0.9, float(np.floor(share.min() * 10) / 10))
+    low = min(0.9, float(np.floor(float(share.min()) * 10) / 10))
     drawn = last.imshow(share, cmap="jet", vmin=low, vmax=1.0)
     last.set_xlabel(names[3])
     _bare(last)
