@@ -22,6 +22,7 @@ const Vector3f kSunLight(1.75F, 1.62F, 1.40F);
 const Vector3f kSkyLight(0.46F, 0.54F, 0.66F);
 const Vector3f kGroundLight(0.22F, 0.20F, 0.18F);
 constexpr float kHazeM = 320.0F;
+constexpr float kSkyM = 100.0F;  // where the sky's places are taken to be
 
 Vector3f skyColor(const Vector3f& way) {
   const float up = std::max(way.z(), 0.0F);
@@ -42,10 +43,8 @@ Vector3f skyColor(const Vector3f& way) {
 
 struct Sample {
   Vector3f light;
-  int object = -1;
-  int triangle = -1;
   Class kind = Class::kSky;
-  float range = 0.0F;
+  Sight sight;
 };
 
 Sample look(const World& world, const Vector3f& origin, const Vector3f& way) {
@@ -53,17 +52,19 @@ Sample look(const World& world, const Vector3f& origin, const Vector3f& way) {
   const Hit hit = world.see(origin, way);
   if (hit.range <= 0.0F) {
     sample.light = skyColor(way);
+    sample.sight = {-1, kSkyM * way, kSkyM};
     return sample;
   }
-  sample.object = hit.object;
-  sample.triangle = hit.triangle;
   sample.kind = world.classOf(hit);
-  sample.range = hit.range;
   const Vector3f p = origin + hit.range * way;
+  const Vector3f place = world.toObjectNow(hit.object, p);
+  // On a slope as the root of the area is, but no more than five times as on a face.
+  const float facing_eye = std::max(std::abs(way.dot(hit.normal)), 0.04F);
+  sample.sight = {hit.object, place, hit.range / std::sqrt(facing_eye)};
   const Surface surface =
       surfaceOf(world.materialOf(hit),
-                {world.tintOf(hit), world.toObjectNow(hit.object, p),
-                 world.normalToObjectNow(hit.object, hit.normal), world.textureOf(hit), hit.range});
+                {world.tintOf(hit), place, world.normalToObjectNow(hit.object, hit.normal),
+                 world.textureOf(hit), hit.range});
   const Vector3f& n = hit.normal;
   float facing = n.dot(kSunDirection);
   if (surface.thin) facing = facing > 0.0F ? 0.35F + 0.65F * facing : -0.55F * facing + 0.2F;
@@ -151,7 +152,9 @@ Picture Camera::render(const World& world, const Transform& T_world_base, std::u
           look(world, origin, R * rayOf(row, column));
     }
   });
-  Picture picture{cv::Mat(height, width, CV_8UC3), cv::Mat(height, width, CV_8UC1)};
+  Picture picture{cv::Mat(height, width, CV_8UC3), cv::Mat(height, width, CV_8UC1), {}};
+  picture.sights.reserve(samples.size());
+  for (const Sample& sample : samples) picture.sights.push_back(sample.sight);
   const float cx = static_cast<float>(model_.cx()), cy = static_cast<float>(model_.cy());
   forEachRow(height, threads, [&](int row) {
     auto* pixel = picture.image.ptr<std::uint8_t>(row);
@@ -166,7 +169,7 @@ Picture Camera::render(const World& world, const Transform& T_world_base, std::u
         const bool inside = step == 1 ? column + 1 < width : row + 1 < height;
         if (!inside) continue;
         const Sample& other = samples[at + static_cast<std::size_t>(step)];
-        edge = edge || other.object != sample.object || other.kind != sample.kind ||
+        edge = edge || other.sight.object != sample.sight.object || other.kind != sample.kind ||
                (other.light - light).squaredNorm() > 0.02F;
       }
       if (edge) {

@@ -13,9 +13,18 @@
 namespace semantic_lidar_fusion {
 namespace simulator {
 
+/// What a pixel's centre shows.
+struct Sight {
+  int object = -1;  ///< none: the sky
+  Eigen::Vector3f
+      place;  ///< on the object, in its coordinates, m; of the sky far away in the world
+  float m_per_rad = 1.0F;  ///< how far apart on the object two rays meet it, by their angle
+};
+
 struct Picture {
-  cv::Mat image;   ///< CV_8UC3, BGR
-  cv::Mat labels;  ///< CV_8UC1: the class at each pixel's centre
+  cv::Mat image;              ///< CV_8UC3, BGR
+  cv::Mat labels;             ///< CV_8UC1: the class at each pixel's centre
+  std::vector<Sight> sights;  ///< by row
 };
 
 class Camera {

@@ -495,8 +495,8 @@ class Simulation {
       const cv::Mat scores =
           options_.perfect_network
               ? perfectScores(picture.labels)
-              : imitateNetwork(picture.labels,
-                               {kFullWidth / kScoreStride, kFullHeight / kScoreStride}, key);
+              : imitateNetwork(picture, {kFullWidth / kScoreStride, kFullHeight / kScoreStride},
+                               1.0 / camera.info().k[0], {options_.seed, key});
       bag->write(ns + "/scores", stamp + kScoreDelayNs, *imageMessage(scores, header));
       savePicture(c, picture);
       const cv::Mat edges = distanceToClassEdge(picture.labels);

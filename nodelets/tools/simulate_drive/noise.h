@@ -2,6 +2,7 @@
 /// Random numbers that depend on their keys alone, so that nothing depends on threads or order.
 #pragma once
 
+#include <Eigen/Core>
 #include <cmath>
 #include <cstdint>
 
@@ -59,6 +60,19 @@ inline float smoothNoise(float x, float y, std::uint32_t key) {
   const float bottom =
       latticeNoise(ix, iy + 1, key) * (1.0F - u) + latticeNoise(ix + 1, iy + 1, key) * u;
   return top * (1.0F - v) + bottom * v;
+}
+
+/// The same in three dimensions.
+inline float smoothNoise(const Eigen::Vector3f& p, std::uint32_t key) {
+  // A plane of whole z is a lattice of its own.
+  const float fz = std::floor(p.z());
+  const auto plane = [key](float z) {
+    return key ^ (static_cast<std::uint32_t>(static_cast<int>(z)) * 0x9E3779B1U);
+  };
+  float w = p.z() - fz;
+  w = w * w * (3.0F - 2.0F * w);
+  return smoothNoise(p.x(), p.y(), plane(fz)) * (1.0F - w) +
+         smoothNoise(p.x(), p.y(), plane(fz + 1.0F)) * w;
 }
 
 }  // namespace simulator
