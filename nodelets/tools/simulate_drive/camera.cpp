@@ -103,15 +103,14 @@ float toneMapped(float light) {
   return std::pow(std::min(std::max(film, 0.0F), 1.0F), 1.0F / 2.2F);
 }
 
-/// Calls work(row) for every row.
+/// Calls work(i) for 0 <= i < count.
 template <typename Work>
-void forEachRow(int rows, int threads, const Work& work) {
+void inParallel(int count, int threads, const Work& work) {
   std::atomic<int> next{0};
   const auto loop = [&] {
-    constexpr int kRowsAtOnce = 8;
-    for (int first = next.fetch_add(kRowsAtOnce); first < rows;
-         first = next.fetch_add(kRowsAtOnce)) {
-      for (int row = first; row < std::min(rows, first + kRowsAtOnce); ++row) work(row);
+    constexpr int kAtOnce = 8;
+    for (int first = next.fetch_add(kAtOnce); first < count; first = next.fetch_add(kAtOnce)) {
+      for (int i = first; i < std::min(count, first + kAtOnce); ++i) work(i);
     }
   };
   std::vector<std::thread> pool;
@@ -119,6 +118,115 @@ void forEachRow(int rows, int threads, const Work& work) {
   loop();
   for (std::thread& thread : pool) thread.join();
 }
+
+/// Calls work(row, column, T_world_camera) for every pixel, while the world stands at the time of
+/// its line.
+template <typename Work>
+void forEachPixel(const DrivePath& path, const Exposure& exposure, const Camera& camera,
+                  int threads, World* world, const Work& work) {
+  const ImageSize& size = camera.info().size;
+  for (int line = 0; line < exposure.lines(); ++line) {
+    const double time = exposure.timeOf(line);
+    world->setInstant(time);
+    const Eigen::Isometry3f eye = (path.pose(time) * camera.T_base_camera()).cast<float>();
+    if (!exposure.rolling()) {
+      inParallel(size.height, threads, [&](int row) {
+        for (int column = 0; column < size.width; ++column) work(row, column, eye);
+      });
+    } else if (exposure.linesAreRows()) {
+      inParallel(size.width, threads, [&](int column) { work(line, column, eye); });
+    } else {
+      inParallel(size.height, threads, [&](int row) { work(row, line, eye); });
+    }
+  }
+}
+
+/// A picture in the making: first one ray for each pixel, then more where they differ.
+class Rendering {
+ public:
+  Rendering(const World& world, const Camera& camera, std::uint64_t key)
+      : world_(world),
+        camera_(camera),
+        key_(key),
+        width_(camera.info().size.width),
+        height_(camera.info().size.height),
+        samples_(static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_)),
+        picture_{cv::Mat(height_, width_, CV_8UC3), cv::Mat(height_, width_, CV_8UC1), {}} {}
+
+  void lookOnce(int row, int column, const Eigen::Isometry3f& eye) {
+    samples_[at(row, column)] =
+        look(world_, eye.translation(), eye.linear() * camera_.ray(row, column));
+  }
+
+  /// After all of lookOnce().
+  void paint(int row, int column, const Eigen::Isometry3f& eye) {
+    const Sample& sample = samples_[at(row, column)];
+    Vector3f light = sample.light;
+    // Edges take three more samples inside of the pixel; its label stays that of the centre.
+    if (isEdge(row, column)) {
+      addAround(row, column, eye, &light);
+      light *= 0.25F;
+    }
+    const float cx = static_cast<float>(camera_.model().cx());
+    const float cy = static_cast<float>(camera_.model().cy());
+    const float x = (static_cast<float>(column) - cx) / static_cast<float>(width_);
+    const float y = (static_cast<float>(row) - cy) / static_cast<float>(width_);
+    light *= 1.0F - 0.55F * (x * x + y * y);
+    Random random(
+        mixKeys(key_, static_cast<std::uint64_t>(row), static_cast<std::uint64_t>(column)));
+    const float grain = static_cast<float>(random.uniform() + random.uniform() - 1.0) * 4.0F;
+    auto& pixel = picture_.image.at<cv::Vec3b>(row, column);
+    for (int channel = 0; channel < 3; ++channel) {
+      const float value = 255.0F * toneMapped(light[2 - channel]) + grain +
+                          static_cast<float>(random.uniform() - 0.5) * 2.0F;
+      pixel[channel] = static_cast<std::uint8_t>(std::min(std::max(value + 0.5F, 0.0F), 255.0F));
+    }
+    picture_.labels.at<std::uint8_t>(row, column) = static_cast<std::uint8_t>(sample.kind);
+  }
+
+  Picture finished() {
+    picture_.sights.reserve(samples_.size());
+    for (const Sample& sample : samples_) picture_.sights.push_back(sample.sight);
+    return picture_;
+  }
+
+ private:
+  std::size_t at(int row, int column) const {
+    return static_cast<std::size_t>(row) * static_cast<std::size_t>(width_) +
+           static_cast<std::size_t>(column);
+  }
+
+  bool isEdge(int row, int column) const {
+    const Sample& sample = samples_[at(row, column)];
+    const auto differs = [&](const Sample& other) {
+      return other.sight.object != sample.sight.object || other.kind != sample.kind ||
+             (other.light - sample.light).squaredNorm() > 0.02F;
+    };
+    return (column + 1 < width_ && differs(samples_[at(row, column + 1)])) ||
+           (row + 1 < height_ && differs(samples_[at(row + 1, column)]));
+  }
+
+  /// Adds three more rays through a pixel.
+  void addAround(int row, int column, const Eigen::Isometry3f& eye, Vector3f* light) const {
+    const int left = std::min(column + 1, width_ - 1) - 1;
+    const int top = std::min(row + 1, height_ - 1) - 1;
+    const Vector3f right = camera_.ray(row, left + 1) - camera_.ray(row, left);
+    const Vector3f down = camera_.ray(top + 1, column) - camera_.ray(top, column);
+    const float offsets[3][2] = {{0.33F, -0.17F}, {-0.33F, 0.17F}, {0.17F, 0.40F}};
+    for (const auto& offset : offsets) {
+      const Vector3f way =
+          (camera_.ray(row, column) + offset[0] * right + offset[1] * down).normalized();
+      *light += look(world_, eye.translation(), eye.linear() * way).light;
+    }
+  }
+
+  const World& world_;
+  const Camera& camera_;
+  std::uint64_t key_;
+  int width_, height_;
+  std::vector<Sample> samples_;
+  Picture picture_;
+};
 
 }  // namespace
 
@@ -135,71 +243,18 @@ Camera::Camera(const CameraInfo& info, const Transform& T_base_camera)
   }
 }
 
-Picture Camera::render(const World& world, const Transform& T_world_base, std::uint64_t key,
-                       int threads) const {
-  const Eigen::Isometry3f T_world_camera = (T_world_base * T_base_camera_).cast<float>();
-  const Vector3f origin = T_world_camera.translation();
-  const Eigen::Matrix3f R = T_world_camera.linear();
-  const int width = info_.size.width, height = info_.size.height;
-  const auto rayOf = [&](int row, int column) {
-    return rays_[static_cast<std::size_t>(row) * static_cast<std::size_t>(width) +
-                 static_cast<std::size_t>(column)];
-  };
-  std::vector<Sample> samples(rays_.size());
-  forEachRow(height, threads, [&](int row) {
-    for (int column = 0; column < width; ++column) {
-      samples[static_cast<std::size_t>(row) * width + column] =
-          look(world, origin, R * rayOf(row, column));
-    }
-  });
-  Picture picture{cv::Mat(height, width, CV_8UC3), cv::Mat(height, width, CV_8UC1), {}};
-  picture.sights.reserve(samples.size());
-  for (const Sample& sample : samples) picture.sights.push_back(sample.sight);
-  const float cx = static_cast<float>(model_.cx()), cy = static_cast<float>(model_.cy());
-  forEachRow(height, threads, [&](int row) {
-    auto* pixel = picture.image.ptr<std::uint8_t>(row);
-    auto* label = picture.labels.ptr<std::uint8_t>(row);
-    for (int column = 0; column < width; ++column, pixel += 3, ++label) {
-      const Sample& sample = samples[static_cast<std::size_t>(row) * width + column];
-      Vector3f light = sample.light;
-      // Edges take three more samples inside of the pixel; its label stays that of the centre.
-      bool edge = false;
-      for (const int step : {1, width}) {
-        const std::size_t at = static_cast<std::size_t>(row) * width + column;
-        const bool inside = step == 1 ? column + 1 < width : row + 1 < height;
-        if (!inside) continue;
-        const Sample& other = samples[at + static_cast<std::size_t>(step)];
-        edge = edge || other.sight.object != sample.sight.object || other.kind != sample.kind ||
-               (other.light - light).squaredNorm() > 0.02F;
-      }
-      if (edge) {
-        const Vector3f right = rayOf(row, std::min(column + 1, width - 1)) -
-                               rayOf(row, std::min(column + 1, width - 1) - 1);
-        const Vector3f down = rayOf(std::min(row + 1, height - 1), column) -
-                              rayOf(std::min(row + 1, height - 1) - 1, column);
-        const float offsets[3][2] = {{0.33F, -0.17F}, {-0.33F, 0.17F}, {0.17F, 0.40F}};
-        for (const auto& offset : offsets) {
-          const Vector3f way =
-              (rayOf(row, column) + offset[0] * right + offset[1] * down).normalized();
-          light += look(world, origin, R * way).light;
-        }
-        light *= 0.25F;
-      }
-      const float x = (static_cast<float>(column) - cx) / static_cast<float>(width);
-      const float y = (static_cast<float>(row) - cy) / static_cast<float>(width);
-      light *= 1.0F - 0.55F * (x * x + y * y);
-      Random random(
-          mixKeys(key, static_cast<std::uint64_t>(row), static_cast<std::uint64_t>(column)));
-      const float grain = static_cast<float>(random.uniform() + random.uniform() - 1.0) * 4.0F;
-      for (int channel = 0; channel < 3; ++channel) {
-        const float value = 255.0F * toneMapped(light[2 - channel]) + grain +
-                            static_cast<float>(random.uniform() - 0.5) * 2.0F;
-        pixel[channel] = static_cast<std::uint8_t>(std::min(std::max(value + 0.5F, 0.0F), 255.0F));
-      }
-      *label = static_cast<std::uint8_t>(sample.kind);
-    }
-  });
-  return picture;
+Picture Camera::render(const DrivePath& path, const Exposure& exposure, std::uint64_t key,
+                       int threads, World* world) const {
+  Rendering rendering(*world, *this, key);
+  forEachPixel(path, exposure, *this, threads, world,
+               [&](int row, int column, const Eigen::Isometry3f& eye) {
+                 rendering.lookOnce(row, column, eye);
+               });
+  forEachPixel(path, exposure, *this, threads, world,
+               [&](int row, int column, const Eigen::Isometry3f& eye) {
+                 rendering.paint(row, column, eye);
+               });
+  return rendering.finished();
 }
 
 cv::Mat distanceToClassEdge(const cv::Mat& labels) {

@@ -8,6 +8,8 @@
 #include <vector>
 
 #include "semantic_lidar_fusion/camera/camera_model.h"
+#include "tools/simulate_drive/drive_path.h"
+#include "tools/simulate_drive/exposure.h"
 #include "tools/simulate_drive/world.h"
 
 namespace semantic_lidar_fusion {
@@ -31,10 +33,16 @@ class Camera {
  public:
   Camera(const CameraInfo& info, const Transform& T_base_camera);
 
-  /// At the world's instant. The same bytes for every number of threads.
-  Picture render(const World& world, const Transform& T_world_base, std::uint64_t key,
-                 int threads) const;
+  /// Each line at its own time. Moves the world's instant. The same bytes for every number of
+  /// threads.
+  Picture render(const DrivePath& path, const Exposure& exposure, std::uint64_t key, int threads,
+                 World* world) const;
 
+  /// Unit vector through a pixel's middle, in the camera's frame.
+  const Eigen::Vector3f& ray(int row, int column) const {
+    return rays_[static_cast<std::size_t>(row) * static_cast<std::size_t>(info_.size.width) +
+                 static_cast<std::size_t>(column)];
+  }
   const CameraInfo& info() const { return info_; }
   const CameraModel& model() const { return model_; }
   const Transform& T_base_camera() const { return T_base_camera_; }
@@ -43,7 +51,7 @@ class Camera {
   CameraInfo info_;
   CameraModel model_;
   Transform T_base_camera_;
-  std::vector<Eigen::Vector3f> rays_;  ///< of the pixels' corners' middles, by row
+  std::vector<Eigen::Vector3f> rays_;  ///< by row
 };
 
 /// 1-px precision is enough nowhere: distance in px from each pixel's centre to the border of the

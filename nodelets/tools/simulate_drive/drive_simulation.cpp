@@ -7,6 +7,7 @@
 #include <sensor_msgs/CompressedImage.h>
 #include <sensor_msgs/Image.h>
 #include <sensor_msgs/PointCloud2.h>
+#include <std_msgs/String.h>
 #include <sys/stat.h>
 #include <tf2_msgs/TFMessage.h>
 #include <unistd.h>
@@ -20,6 +21,7 @@
 #include <memory>
 #include <opencv2/imgcodecs.hpp>
 #include <set>
+#include <sstream>
 #include <vector>
 
 #include "edge/conversions.h"
@@ -31,9 +33,12 @@
 #include "tools/common/progress_bar.h"
 #include "tools/simulate_drive/camera.h"
 #include "tools/simulate_drive/drive_path.h"
+#include "tools/simulate_drive/errors.h"
+#include "tools/simulate_drive/exposure.h"
 #include "tools/simulate_drive/lidar.h"
 #include "tools/simulate_drive/network.h"
 #include "tools/simulate_drive/noise.h"
+#include "tools/simulate_drive/odometry.h"
 #include "tools/simulate_drive/rig.h"
 #include "tools/simulate_drive/street.h"
 #include "tools/simulate_drive/visibility.h"
@@ -50,10 +55,6 @@ constexpr double kImagePhaseS = 0.0113;  // images keep no step with the lidar
 constexpr int kReferenceCamera = 0;
 constexpr StampNs kScoreDelayNs = 40000000;
 constexpr int kScoreStride = 8;  // full-resolution pixels a cell
-// A car's wheel encoders and gyroscope.
-constexpr double kSpeedScaleSigma = 0.005, kSpeedSigma = 0.03;    // of the speed; m/s
-constexpr double kYawBiasSigma = 8.7e-4, kYawRateSigma = 2.6e-3;  // rad/s
-constexpr double kTiltSigma = 5e-4;                               // rad
 constexpr int kJpegQuality = 92;
 
 /// A bag that takes its name when it is whole.
@@ -167,62 +168,6 @@ nav_msgs::Odometry odometryMessage(const Transform& T, double speed, double yaw_
   return message;
 }
 
-/// Dead reckoning from wheel speed and yaw rate; begins at the true pose.
-class Odometry {
- public:
-  Odometry(const DrivePath& path, std::uint64_t seed, bool exact)
-      : path_(path), random_(mixKeys(seed, 0x0D0)), exact_(exact) {
-    scale_ = 1.0 + kSpeedScaleSigma * random_.normal();
-    bias_ = kYawBiasSigma * random_.normal();
-  }
-
-  /// The next reading; times must rise.
-  Transform next(double time_s) {
-    const Transform truth = path_.pose(time_s);
-    const PathPoint now = path_.roadAt(path_.distance(time_s));
-    if (exact_) return truth;
-    if (!started_) {
-      x_ = now.x;
-      y_ = now.y;
-      heading_ = now.heading;
-      started_ = true;
-    } else {
-      const double dt = time_s - last_s_;
-      const double step =
-          scale_ * (now.distance - last_.distance) + kSpeedSigma * random_.normal() * dt;
-      const double turn =
-          now.heading - last_.heading + (bias_ + kYawRateSigma * random_.normal()) * dt;
-      x_ += step * std::cos(heading_ + 0.5 * turn);
-      y_ += step * std::sin(heading_ + 0.5 * turn);
-      heading_ += turn;
-    }
-    // Attitude errors last for some tenths of a second.
-    tilt_x_ = 0.97 * tilt_x_ + 0.24 * kTiltSigma * random_.normal();
-    tilt_y_ = 0.97 * tilt_y_ + 0.24 * kTiltSigma * random_.normal();
-    last_ = now;
-    last_s_ = time_s;
-    Transform T = Transform::Identity();
-    T.translation() = Eigen::Vector3d(x_, y_, truth.translation().z());
-    const Eigen::Matrix3d tilt = (Eigen::AngleAxisd(tilt_y_, Eigen::Vector3d::UnitY()) *
-                                  Eigen::AngleAxisd(tilt_x_, Eigen::Vector3d::UnitX()))
-                                     .toRotationMatrix();
-    T.linear() =
-        Eigen::AngleAxisd(heading_ - now.heading, Eigen::Vector3d::UnitZ()).toRotationMatrix() *
-        truth.linear() * tilt;
-    return T;
-  }
-
- private:
-  const DrivePath& path_;
-  Random random_;
-  bool exact_;
-  bool started_ = false;
-  double scale_ = 1.0, bias_ = 0.0;
-  double x_ = 0.0, y_ = 0.0, heading_ = 0.0, tilt_x_ = 0.0, tilt_y_ = 0.0;
-  double last_s_ = 0.0;
-  PathPoint last_;
-};
-
 struct Scan {
   SimulatedScan simulated;
   TimedCloud cloud;  ///< as the package decodes it
@@ -240,7 +185,14 @@ class Simulation {
         checkpoint_(checkpoint),
         path_(options.duration_s, options.speed_mps),
         cameras_(makeCameras(options.scale, options.camera_drop_m)),
-        odometry_(path_, options.seed, options.exact_odometry) {}
+        errors_(options.errors, options.seed),
+        odometry_(path_, options.errors, options.seed, options.exact_odometry) {
+    for (std::size_t c = 0; c < cameras_.size(); ++c) {
+      MountedCamera& mounted = cameras_[c];
+      mounted.camera = Camera(errors_.realInfo(mounted.said_info, c, options.scale),
+                              mounted.T_base_said * errors_.ofPose(c));
+    }
+  }
 
   void run() {
     Bag bag(options_.output, options_.force);
@@ -332,10 +284,11 @@ class Simulation {
       SelectorScan scan{scans_[i].interval, {}};
       for (const MountedCamera& mounted : cameras_) {
         if (!sweeps) break;
-        const Transform T_camera_lidar = mounted.camera.T_base_camera().inverse() * lidarPose();
+        const Transform T_camera_lidar = mounted.T_base_said.inverse() * lidarPose();
         scan.sweep_ns.push_back(
             sweepTime(scans_[i].cloud,
-                      {std::make_shared<CameraModel>(mounted.camera.model()), T_camera_lidar}));
+                      {std::make_shared<CameraModel>(mounted.said_info, CameraModelOptions{}),
+                       T_camera_lidar}));
       }
       selector.addScan(scan, scans_[i].record_ns);
       take(selector.advance(scans_[i].record_ns));
@@ -358,10 +311,61 @@ class Simulation {
     tf2_msgs::TFMessage transforms;
     transforms.transforms.push_back(transformMessage(lidarPose(), stamp, "base_link", kLidarFrame));
     for (const MountedCamera& mounted : cameras_) {
-      transforms.transforms.push_back(transformMessage(
-          mounted.camera.T_base_camera(), stamp, "base_link", mounted.camera.info().frame_id));
+      transforms.transforms.push_back(
+          transformMessage(mounted.T_base_said, stamp, "base_link", mounted.said_info.frame_id));
     }
     bag->write("/tf_static", stamp, transforms, true);
+    if (told()) {
+      std_msgs::String message;
+      message.data = errorsText();
+      bag->write("/truth/errors", stamp, message, true);
+    }
+  }
+
+  /// Whether the rig of the bag differs from that of the drive.
+  bool told() const {
+    const ErrorSizes& sizes = options_.errors;
+    return sizes.rotation_deg > 0.0 || sizes.translation_m > 0.0 || sizes.stamp_s > 0.0 ||
+           sizes.focal_share > 0.0 || sizes.centre_px > 0.0 || sizes.ofOdometry() ||
+           options_.shutter.readout_s > 0.0;
+  }
+
+  /// What the bag gets wrong, as JSON (docs/simulator.md lists it).
+  std::string errorsText() const {
+    std::ostringstream text;
+    text.precision(17);
+    const ErrorSizes& sizes = options_.errors;
+    text << "{\"seed\": " << options_.seed
+         << ", \"odometry\": {\"velocity_mps\": " << sizes.velocity_mps
+         << ", \"rate_dps\": " << sizes.rate_dps << ", \"correlation_s\": " << sizes.correlation_s
+         << "}, \"readout_s\": " << options_.shutter.readout_s << ", \"cameras\": {";
+    const auto list = [&text](const char* name, const auto& values, std::size_t count) {
+      text << "\"" << name << "\": [";
+      for (std::size_t i = 0; i < count; ++i) {
+        text << (i == 0 ? "" : ", ") << values[static_cast<int>(i)];
+      }
+      text << "]";
+    };
+    for (std::size_t c = 0; c < cameras_.size(); ++c) {
+      const Transform T = errors_.ofPose(c);
+      const Eigen::AngleAxisd turn(T.linear());
+      const Eigen::Vector3d rotation = turn.angle() * turn.axis();
+      const CameraInfo& info = cameras_[c].camera.info();
+      text << (c == 0 ? "\"" : ", \"") << cameras_[c].name << "\": {";
+      list("translation_m", T.translation(), 3);
+      text << ", ";
+      list("rotation_rad", rotation, 3);
+      text << ", ";
+      const double lens[4] = {info.k[0], info.k[4], info.k[2], info.k[5]};
+      list("fx_fy_cx_cy", lens, 4);
+      text << ", \"exposed_late_s\": {";
+      for (std::size_t i = 0; i < images_.size(); ++i) {
+        text << (i == 0 ? "\"" : ", \"") << images_[i] << "\": " << errors_.ofStamp(images_[i], c);
+      }
+      text << "}}";
+    }
+    text << "}}";
+    return text.str();
   }
 
   /// Odometry, camera_info and scans, as they come in time.
@@ -393,7 +397,7 @@ class Simulation {
 
   void writeCameraInfos(StampNs stamp, Bag* bag) {
     for (const MountedCamera& mounted : cameras_) {
-      const CameraInfo& info = mounted.camera.info();
+      const CameraInfo& info = mounted.said_info;
       sensor_msgs::CameraInfo message;
       message.header = headerOf(stamp, info.frame_id);
       message.width = static_cast<std::uint32_t>(info.size.width);
@@ -477,16 +481,15 @@ class Simulation {
   }
 
   void renderImages(StampNs stamp, Bag* bag) {
-    const double time = toSeconds(stamp - kStartNs);
-    world_.setInstant(time);
-    const Transform T_world_base = path_.pose(time);
     const auto found = used_.find(stamp);
     for (std::size_t c = 0; c < cameras_.size(); ++c) {
       const Camera& camera = cameras_[c].camera;
       const bool used = found != used_.end() && found->second.count(static_cast<int>(c)) != 0;
       if (!used && !options_.all_images) continue;
       const std::uint64_t key = mixKeys(options_.seed, static_cast<std::uint64_t>(stamp), c);
-      const Picture picture = camera.render(world_, T_world_base, key, options_.threads);
+      const Exposure exposure(options_.shutter, camera.info().size,
+                              toSeconds(stamp - kStartNs) + errors_.ofStamp(stamp, c));
+      const Picture picture = camera.render(path_, exposure, key, options_.threads, &world_);
       const std_msgs::Header header = headerOf(stamp, camera.info().frame_id);
       const std::string ns = "/gmsl/" + cameras_[c].name;
       writeImage(picture, ns, stamp, header, bag);
@@ -501,7 +504,7 @@ class Simulation {
       savePicture(c, picture);
       const cv::Mat edges = distanceToClassEdge(picture.labels);
       for (const std::size_t scan : found->second.at(static_cast<int>(c))) {
-        lookForPoints(c, time, T_world_base, picture.labels, edges, &scans_[scan]);
+        lookForPoints(c, exposure, picture.labels, edges, &scans_[scan]);
       }
     }
   }
@@ -531,30 +534,71 @@ class Simulation {
     }
   }
 
-  /// Marks the points of a scan that the camera sees, by a ray to where each is now.
-  void lookForPoints(std::size_t c, double time, const Transform& T_world_base,
-                     const cv::Mat& labels, const cv::Mat& edges, Scan* scan) const {
+  /// A point where an image shows it.
+  struct Showing {
+    std::size_t point;
+    double time_s;  ///< of the line that shows it
+    Eigen::Vector2d pixel;
+  };
+
+  /// The points of a scan that are before a camera, by lines of the image.
+  std::vector<Showing> showingsOf(const Camera& camera, const Exposure& exposure,
+                                  const Scan& scan) const {
+    constexpr int kMostRounds = 20;
+    constexpr double kSettledS = 1e-8;
+    std::vector<Showing> showings;
+    const ImageSize& size = camera.model().imageSize();
+    for (std::size_t i = 0; i < scan.simulated.echoes.size(); ++i) {
+      const Echo& echo = scan.simulated.echoes[i];
+      // The line follows from the pixel, and the pixel from the line's time.
+      double time = exposure.time();
+      std::optional<Eigen::Vector2d> pixel;
+      for (int round = 0; round < kMostRounds; ++round) {
+        const Transform T_camera_world = (path_.pose(time) * camera.T_base_camera()).inverse();
+        pixel = camera.model().project(T_camera_world *
+                                       world_.toWorld(echo.object, echo.p_object, time));
+        if (!pixel) break;
+        const double next = exposure.timeAt(
+            {std::min(std::max(pixel->x(), -1.0 * size.width), 2.0 * size.width),
+             std::min(std::max(pixel->y(), -1.0 * size.height), 2.0 * size.height)});
+        if (std::abs(next - time) < kSettledS) break;
+        time = next;
+      }
+      if (pixel && inImage(pixel->x(), pixel->y(), size)) showings.push_back({i, time, *pixel});
+    }
+    if (exposure.rolling()) {
+      std::stable_sort(showings.begin(), showings.end(),
+                       [](const Showing& a, const Showing& b) { return a.time_s < b.time_s; });
+    }
+    return showings;
+  }
+
+  /// Marks the points of a scan that the camera sees, by a ray to where each is when it is exposed.
+  void lookForPoints(std::size_t c, const Exposure& exposure, const cv::Mat& labels,
+                     const cv::Mat& edges, Scan* scan) {
     const Camera& camera = cameras_[c].camera;
-    const Transform T_world_camera = T_world_base * camera.T_base_camera();
-    const Transform T_camera_world = T_world_camera.inverse();
-    const ReturnsAround returns(scan->simulated, path_, lidarPose(), kStartNs, time);
+    const ReturnsAround returns(scan->simulated, path_, lidarPose(), kStartNs, exposure.time());
     const auto mark = [c](std::uint16_t* bits, bool set) {
       if (set) *bits = static_cast<std::uint16_t>(*bits | (1U << c));
     };
-    for (std::size_t i = 0; i < scan->simulated.echoes.size(); ++i) {
+    // The world moves on once a line is over.
+    const double line_s = options_.shutter.readout_s / exposure.lines();
+    double set_s = exposure.time();
+    world_.setInstant(set_s);
+    for (const Showing& showing : showingsOf(camera, exposure, *scan)) {
+      if (std::abs(showing.time_s - set_s) > line_s) world_.setInstant(set_s = showing.time_s);
+      const std::size_t i = showing.point;
       const Echo& echo = scan->simulated.echoes[i];
-      const Eigen::Vector3d p_world = world_.toWorld(echo.object, echo.p_object, time);
-      const std::optional<Eigen::Vector2d> pixel = camera.model().project(T_camera_world * p_world);
-      if (!pixel || !inImage(pixel->x(), pixel->y(), camera.model().imageSize())) continue;
-      const PointView view =
-          viewPoint(world_, returns, T_world_camera.translation(), echo.object, p_world);
+      const Transform T_world_camera = path_.pose(showing.time_s) * camera.T_base_camera();
+      const PointView view = viewPoint(world_, returns, T_world_camera.translation(), echo.object,
+                                       world_.toWorld(echo.object, echo.p_object, showing.time_s));
       mark(&scan->visible[i], view.visible);
       mark(&scan->catchable[i], view.catchable);
       mark(&scan->apart[i], view.apart);
       mark(&scan->silhouette[i], view.silhouette);
       if (!view.visible) continue;
       // Through a gap smaller than a pixel, the pixel's centre shows something else: an edge.
-      const int u = pixelIndex(pixel->x()), v = pixelIndex(pixel->y());
+      const int u = pixelIndex(showing.pixel.x()), v = pixelIndex(showing.pixel.y());
       const bool shown = labels.at<std::uint8_t>(v, u) == static_cast<std::uint8_t>(echo.kind);
       scan->edge_px[i * cameras_.size() + c] = shown ? edges.at<float>(v, u) : 0.0F;
     }
@@ -564,6 +608,7 @@ class Simulation {
   void (*checkpoint_)();
   DrivePath path_;
   std::vector<MountedCamera> cameras_;
+  DrawnErrors errors_;
   Odometry odometry_;
   World world_;
   std::vector<Scan> scans_;

@@ -6,6 +6,8 @@
 #include <string>
 
 #include "semantic_lidar_fusion/sync/scan_selector.h"
+#include "tools/simulate_drive/errors.h"
+#include "tools/simulate_drive/exposure.h"
 
 namespace semantic_lidar_fusion {
 namespace simulator {
@@ -22,6 +24,8 @@ struct SimulationOptions {
   bool exact_odometry = false;
   bool range_noise = true;
   bool perfect_network = false;
+  Shutter shutter;                                              ///< of all cameras
+  ErrorSizes errors;                                            ///< of what the bag says of the rig
   ImageChoice image_choice = ImageChoice::kClosestToReference;  ///< that scans are taken to make
   bool all_images = false;  ///< else only those that a scan uses
   bool raw_images = false;  ///< else JPEG

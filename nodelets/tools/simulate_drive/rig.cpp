@@ -52,7 +52,7 @@ std::vector<MountedCamera> makeCameras(double scale, double drop_m) {
     T.linear() =
         Eigen::AngleAxisd(mount.yaw_deg * kRadPerDeg, Eigen::Vector3d::UnitZ()).toRotationMatrix() *
         R_body_optical;
-    cameras.push_back({mount.name, Camera(info, T)});
+    cameras.push_back({mount.name, info, T, Camera(info, T)});
   }
   return cameras;
 }

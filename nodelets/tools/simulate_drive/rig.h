@@ -16,7 +16,9 @@ constexpr int kFullWidth = 1920, kFullHeight = 1208;
 
 struct MountedCamera {
   std::string name;  ///< topics live in /gmsl/<name>/
-  Camera camera;
+  CameraInfo said_info;
+  Transform T_base_said;
+  Camera camera;  ///< as it really is
 };
 
 /// Five fisheye cameras of 100 deg, `drop_m` below the lidar, images `scale` times 1920 x 1208.

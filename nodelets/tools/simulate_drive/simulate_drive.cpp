@@ -10,6 +10,7 @@
 #include <limits>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "edge/version.h"
@@ -35,6 +36,8 @@ the truth beside it. config/demo.yaml is its rig. The same options give the same
                            the decoder's points in their order, stamped with the first one's time
   /gmsl/*/labels_truth     class ids of the images that scans use
   /truth/poses             where the vehicle really is
+  /truth/errors            with any of the options --readout and --*-error, --stamp-jitter: what was
+                           drawn by the seed, as JSON (docs/simulator.md)
 
 Scores imitate ENet at a stride of 8 full-size pixels, for the images that scans use: its borders,
 confusions, thin things and overconfidence, as measured on labelled CamVid photos by
@@ -53,7 +56,18 @@ options:
   --image-choice closest_to_reference|closest_to_sweep
                        as in the rig file: which images a scan uses, and truth is told for
                        (default closest_to_reference)
+  --readout S          rolling shutter: time from the first line to the one after the last, 0 to 0.1
+                       (default 0, all at one time)
+  --shutter-direction down|up|right|left  where its readout goes in the image (default down)
+  --stamp-row first|middle|last  the line that is exposed at the image's stamp (default first)
   --raw                images as sensor_msgs/Image, not JPEG (set transport: raw in the rig)
+  --extrinsic-error DEG,M  the cameras stand otherwise than tf says, by standard deviations around
+                       and along each axis
+  --intrinsic-error SHARE,PX  their lenses are others than camera_info says: focal length, centre
+                       (pixels of full-size images)
+  --stamp-jitter S     images are exposed earlier or later than their stamps, 0 to 0.02
+  --odometry-error M/S,DEG/S,S  velocity and rate errors along and around each axis of the vehicle,
+                       and their correlation time, in place of those of wheels and gyroscope
   --static             nobody else moves
   --perfect-network    scores of the true class, at the images' resolution
   --exact              that, exact odometry and no range noise
@@ -101,6 +115,39 @@ double wholeNumber(const std::string& name, const std::string& text, double leas
   return value;
 }
 
+/// As many numbers as `most` has, between commas; each from 0 to its own of `most`.
+std::vector<double> numbers(const std::string& name, const std::string& text,
+                            const std::vector<double>& most) {
+  std::vector<std::string> parts(1);
+  for (const char c : text) {
+    if (c == ',') {
+      parts.emplace_back();
+    } else {
+      parts.back() += c;
+    }
+  }
+  if (parts.size() != most.size()) {
+    throw UsageError(name + " is '" + text + "'; it must be " + std::to_string(most.size()) +
+                     " numbers with commas between them");
+  }
+  std::vector<double> values;
+  for (std::size_t i = 0; i < most.size(); ++i) {
+    values.push_back(number(name, parts[i], 0.0, most[i]));
+  }
+  return values;
+}
+
+template <typename Value>
+Value choice(const std::string& name, const std::string& text,
+             const std::vector<std::pair<std::string, Value>>& values) {
+  std::string known;
+  for (const auto& value : values) {
+    if (value.first == text) return value.second;
+    known += (known.empty() ? "" : ", ") + value.first;
+  }
+  throw UsageError(name + " is '" + text + "'; it must be one of " + known);
+}
+
 SimulationOptions parseOptions(const std::vector<std::string>& arguments) {
   SimulationOptions options;
   std::size_t i = 0;
@@ -140,6 +187,33 @@ SimulationOptions parseOptions(const std::vector<std::string>& arguments) {
       }
       options.image_choice = choice == "closest_to_sweep" ? ImageChoice::kClosestToSweep
                                                           : ImageChoice::kClosestToReference;
+    } else if (name == "--readout") {
+      options.shutter.readout_s = number(name, value(), 0.0, 0.1);
+    } else if (name == "--shutter-direction") {
+      options.shutter.way = choice<ReadoutWay>(name, value(),
+                                               {{"down", ReadoutWay::kDown},
+                                                {"up", ReadoutWay::kUp},
+                                                {"right", ReadoutWay::kRight},
+                                                {"left", ReadoutWay::kLeft}});
+    } else if (name == "--stamp-row") {
+      options.shutter.stamp_at =
+          choice<double>(name, value(), {{"first", 0.0}, {"middle", 0.5}, {"last", 1.0}});
+    } else if (name == "--extrinsic-error") {
+      const auto sizes = numbers(name, value(), {5.0, 0.5});
+      options.errors.rotation_deg = sizes[0];
+      options.errors.translation_m = sizes[1];
+    } else if (name == "--intrinsic-error") {
+      const auto sizes = numbers(name, value(), {0.05, 50.0});
+      options.errors.focal_share = sizes[0];
+      options.errors.centre_px = sizes[1];
+    } else if (name == "--stamp-jitter") {
+      options.errors.stamp_s = number(name, value(), 0.0, 0.02);
+    } else if (name == "--odometry-error") {
+      const auto sizes = numbers(name, value(), {5.0, 60.0, 100.0});
+      options.errors.velocity_mps = sizes[0];
+      options.errors.rate_dps = sizes[1];
+      options.errors.correlation_s = sizes[2];
+      if (!(sizes[2] > 0.0)) throw UsageError(name + ": the correlation time must be above 0");
     } else if (name == "--raw") {
       options.raw_images = true;
     } else if (name == "--static") {
