@@ -32,6 +32,7 @@ import sys
 import cv2
 import numpy as np
 import yaml
+from scipy.spatial import cKDTree
 
 PACKAGE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "..")
 CONFIG = os.path.join(PACKAGE, "config")
@@ -210,12 +211,9 @@ class SeenDrive:
         return world[kept], label, seen_as[kept], surface, middle
 
 
-def print_persistence(drive, names):
-    """How long errors last: see the module's text."""
-    from scipy.spatial import cKDTree
-
-    moving = [names.index(name) for name in MOVING]
-    print("\nstatic points seen again: correlation of being wrong, wrong again, another label")
+def persistence(drive, names):
+    """How long errors last, by the lag in scans: see the module's text."""
+    moving, result = [names.index(name) for name in MOVING], {}
     for lag in LAGS:
         pairs, ways = [], []
         for early, late in zip(drive.scans, drive.scans[lag:]):
@@ -227,12 +225,25 @@ def print_persistence(drive, names):
             one, two, truth = early[2][here], late[2][other[here]], early[1][here]
             pairs.append(np.stack([one != truth, two != truth, one != two], axis=1))
             ways.append(np.linalg.norm(drive.place(late[4]) - drive.place(early[4])))
-        if not pairs:
-            continue
-        wrong, again, changed = np.concatenate(pairs).T
-        text = "%d scans, %.1f m: %7d pairs, correlation %.2f, wrong again %.2f, changed %.3f"
-        both = (lag, np.mean(ways), len(wrong), np.corrcoef(wrong, again)[0, 1])
-        print(text % (*both, again[wrong].mean(), changed.mean()))
+        if pairs:
+            wrong, again, changed = np.concatenate(pairs).T
+            result[lag] = {
+                "way_m": np.mean(ways),
+                "pairs": len(wrong),
+                "correlation": np.corrcoef(wrong, again)[0, 1],
+                "again": again[wrong].mean(),
+                "changed": changed.mean(),
+            }
+    return result
+
+
+def print_persistence(drive, names):
+    print("\nstatic points seen again: correlation of being wrong, wrong again, another label")
+    for lag, row in persistence(drive, names).items():
+        print(
+            "%d scans, %.1f m: %7d pairs, correlation %.2f, wrong again %.2f, changed %.3f"
+            % (lag, *row.values())
+        )
 
 
 def on_grid(values, columns, rows):

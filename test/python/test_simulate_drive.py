@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: MIT
 """The simulated drive against itself: packets, truth, pictures, poses, and the same bytes twice."""
 
+import json
 import os
 import struct
 import subprocess
+import sys
 
+import cv2
 import numpy as np
 import pytest
 
 rosbag = pytest.importorskip("rosbag")
 
+sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "benchmark"))
+import network_errors  # noqa: E402
 from semantic_lidar_fusion.bags import cloud_io  # noqa: E402
 
 PROGRAM = os.path.join(os.environ.get("SLF_BIN_DIR", ""), "simulate_drive")
@@ -101,8 +106,6 @@ def test_scans_are_whole_turns_without_gaps(noisy_bag):
 
 def edge_distance(labels):
     """Distance (px) from each pixel's centre to that of the nearest pixel of another class."""
-    import cv2
-
     result = np.full(labels.shape, np.inf, np.float32)
     for kind in np.unique(labels):
         inside = (labels == kind).astype(np.uint8)
@@ -125,66 +128,116 @@ def matrix(position, q):
     return result
 
 
-def test_visible_points_fall_on_their_class(tmp_path):
-    """Standing world: the measured points, moved by the true poses and seen through the lens, meet
-    pixels of their own class wherever an edge is more than 1.5 px away."""
-    bag = str(tmp_path / "standing.bag")
-    done = simulate(bag, "--duration", "0.2", "--scale", "0.3", "--exact", "--static")
-    assert done.returncode == 0, done.stderr
-    poses = read(bag, "/truth/poses")
-    times = np.array([message.header.stamp.to_nsec() for message in poses])
-    T_world_base = [matrix(m.pose.pose.position, m.pose.pose.orientation) for m in poses]
+def told_errors(bag):
+    """/truth/errors, or what it would be where nothing is wrong."""
+    said = read(bag, "/truth/errors")
+    assert len(said) <= 1
+    return json.loads(said[0].data) if said else None
+
+
+def mounts_and_lenses(bag, errors):
+    """Per camera: T_base_camera and (fx, fy, cx, cy) as they really are, and the camera_info."""
     statics = {
         t.child_frame_id: matrix(t.transform.translation, t.transform.rotation)
         for message in read(bag, "/tf_static")
         for t in message.transforms
     }
+    result = {}
+    for name in CAMERAS:
+        info = read(bag, "/gmsl/%s/camera_info" % name)[0]
+        mount, lens = statics[info.header.frame_id], (info.K[0], info.K[4], info.K[2], info.K[5])
+        if errors:
+            told = errors["cameras"][name]
+            moved = np.eye(4)
+            moved[:3, :3] = cv2.Rodrigues(np.array(told["rotation_rad"], float))[0]
+            moved[:3, 3] = told["translation_m"]
+            mount, lens = mount @ moved, told["fx_fy_cx_cy"]
+        result[name] = mount, lens, info
+    return statics, result
 
-    def pose(stamp):
-        """Linear between two readings 10 ms apart: off by less than 0.2 mm."""
-        right = int(np.searchsorted(times, stamp))
-        weight = (stamp - times[right - 1]) / (times[right] - times[right - 1])
+
+def line_time(u, v, size, readout, direction, stamp_row):
+    """s after the image's time at which the line through pixel (u, v) is exposed."""
+    lines, at = (size[1], v) if direction in ("down", "up") else (size[0], u)
+    order = at if direction in ("down", "right") else lines - 1 - at
+    stamped = {"first": 0, "middle": 0.5 * (lines - 1), "last": lines - 1}[stamp_row]
+    return (order - stamped) * readout / lines
+
+
+def bend(p, lens, d):
+    """Pixels of points in the camera's frame: the equidistant lens."""
+    r = np.hypot(p[:, 0], p[:, 1])
+    theta = np.arctan2(r, p[:, 2])
+    t2 = theta * theta
+    bent = theta * (1 + t2 * (d[0] + t2 * (d[1] + t2 * (d[2] + t2 * d[3]))))
+    return lens[0] * bent * p[:, 0] / r + lens[2], lens[1] * bent * p[:, 1] / r + lens[3]
+
+
+ALL_ERRORS = ["--extrinsic-error", "1,0.05", "--intrinsic-error", "0.01,10"] + [
+    "--stamp-jitter",
+    "0.004",
+    "--odometry-error",
+    "0.2,1,0.2",
+]
+
+
+@pytest.mark.parametrize(
+    "shutter, options",
+    [
+        ((0.0, "down", "first"), ["--exact"]),
+        ((0.04, "left", "middle"), ["--exact"]),
+        ((0.03, "up", "last"), ["--exact"] + ALL_ERRORS),
+    ],
+)
+def test_visible_points_fall_on_their_class(tmp_path, shutter, options):
+    """Standing world: the measured points, moved by the true poses to the time of the line that
+    shows them and seen through the true lens, meet pixels of their own class wherever an edge is
+    more than 2 px away."""
+    bag = str(tmp_path / "standing.bag")
+    turn = ["--readout", str(shutter[0]), "--shutter-direction", shutter[1]]
+    turn += ["--stamp-row", shutter[2], "--speed", "15"]
+    done = simulate(bag, "--duration", "0.2", "--scale", "0.25", "--static", *(turn + options))
+    assert done.returncode == 0, done.stderr
+    errors = told_errors(bag)
+    assert (errors is None) == (shutter[0] == 0)
+    poses = read(bag, "/truth/poses")
+    times = np.array([message.header.stamp.to_nsec() for message in poses])
+    T_world_base = np.array([matrix(m.pose.pose.position, m.pose.pose.orientation) for m in poses])
+    statics, cameras = mounts_and_lenses(bag, errors)
+
+    def pose(stamps):
+        """(N, 4, 4), linear between two readings 10 ms apart: off by less than 0.4 mm."""
+        stamps = np.asarray(stamps, float)
+        right = np.searchsorted(times, stamps)
+        weight = ((stamps - times[right - 1]) / (times[right] - times[right - 1]))[:, None, None]
         return (1 - weight) * T_world_base[right - 1] + weight * T_world_base[right]
 
-    checked = wrong = 0
+    checked = wrong = told_wrong = 0
     truths = [cloud_io.to_array(m) for m in read(bag, "/points_truth")]
     scans = read(bag, "/velodyne/front/velodyne_packets")
     for scan, truth in zip(scans, truths):
-        # The pose of each point's packet block; all its rays within 0.111 ms, 1.2 mm of driving.
-        world = np.empty((len(truth), 3))
-        at = 0
-        for packet in scan.packets:
-            data = bytes(packet.data)
-            for block in range(12):
-                raw = [
-                    struct.unpack_from("<H", data, 100 * block + 4 + 3 * i)[0] for i in range(32)
-                ]
-                count = sum(1 for value in raw if value)
-                T = pose(packet.stamp.to_nsec() + 2 * 55296 * block + 55296)
-                T = T @ statics[scan.header.frame_id]
-                part = truth[at : at + count]
-                xyz = np.stack([part["x"], part["y"], part["z"]], axis=1)
-                world[at : at + count] = xyz @ T[:3, :3].T + T[:3, 3]
-                at += count
-        assert at == len(truth)
+        stamps = network_errors.return_times(scan)
+        assert len(stamps) == len(truth)
+        lidar = pose(stamps) @ statics[scan.header.frame_id]
+        local = np.stack([truth["x"], truth["y"], truth["z"], np.ones(len(truth))], axis=1)
+        world = np.einsum("nij,nj->ni", lidar, local)
+        middle = scan.packets[len(scan.packets) // 2].stamp.to_nsec()
         for index, name in enumerate(CAMERAS):
-            info = read(bag, "/gmsl/%s/camera_info" % name)[0]
+            mount, lens, info = cameras[name]
             images = read(bag, "/gmsl/%s/labels_truth" % name)
-            middle = scan.packets[len(scan.packets) // 2].stamp.to_nsec()
             image = min(images, key=lambda m: abs(m.header.stamp.to_nsec() - middle))
             labels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width)
-            T = np.linalg.inv(pose(image.header.stamp.to_nsec()) @ statics[info.header.frame_id])
-            p = world @ T[:3, :3].T + T[:3, 3]
+            stamp = image.header.stamp.to_nsec()
+            size = (image.width, image.height)
             seen = (truth["visible"] >> index & 1).astype(bool)
-            r = np.hypot(p[:, 0], p[:, 1])
-            theta = np.arctan2(r, p[:, 2])
-            t2 = theta * theta
-            bent = theta * (
-                1 + t2 * (info.D[0] + t2 * (info.D[1] + t2 * (info.D[2] + t2 * info.D[3])))
-            )
-            u = info.K[0] * bent * p[:, 0] / r + info.K[2]
-            v = info.K[4] * bent * p[:, 1] / r + info.K[5]
-            column, row = np.floor(u[seen] + 0.5).astype(int), np.floor(v[seen] + 0.5).astype(int)
+            late = errors["cameras"][name]["exposed_late_s"][str(stamp)] if errors else 0.0
+            after = np.zeros(seen.sum())
+            for _ in range(8):
+                T = np.linalg.inv(pose(stamp + 1e9 * (late + after)) @ mount)
+                p = np.einsum("nij,nj->ni", T, world[seen])[:, :3]
+                u, v = bend(p, lens, info.D)
+                after = line_time(u, v, size, *shutter)
+            column, row = np.floor(u + 0.5).astype(int), np.floor(v + 0.5).astype(int)
             inside = (column >= 0) & (row >= 0) & (column < image.width) & (row < image.height)
             # Points at the border may fall just outside, by their rounded poses.
             assert inside.mean() > 0.995
@@ -193,9 +246,71 @@ def test_visible_points_fall_on_their_class(tmp_path):
             label = truth["label"][seen][inside]
             checked += far.sum()
             wrong += (labels[row, column] != label)[far].sum()
-    assert checked > 20000
+            # The same by what the bag says of the rig.
+            said = np.linalg.inv(pose([stamp])[0] @ statics[info.header.frame_id])
+            u, v = bend(
+                (world[seen] @ said.T)[:, :3], (info.K[0], info.K[4], info.K[2], info.K[5]), info.D
+            )
+            column = np.clip(np.floor(u + 0.5).astype(int), 0, image.width - 1)[inside]
+            row = np.clip(np.floor(v + 0.5).astype(int), 0, image.height - 1)[inside]
+            told_wrong += (labels[row, column] != label)[far].sum()
+    assert checked > 15000
     # What shows through a gap smaller than a pixel has another class than its pixel.
     assert wrong <= 1e-3 * checked
+    # Whoever ignores shutter and errors is wrong at far more points.
+    assert shutter[0] == 0 or told_wrong > 5 * wrong + 0.003 * checked
+
+
+def test_odometry_errs_as_it_is_told(tmp_path):
+    """Velocity and rate errors are Ornstein-Uhlenbeck processes: of steps of 10 ms, their standard
+    deviation and the correlation of one with the next."""
+    bag, tau = str(tmp_path / "drift.bag"), 0.01
+    done = simulate(
+        bag, "--duration", "0.2", "--scale", "0.1", "--odometry-error", "0.3,2,%g" % tau
+    )
+    assert done.returncode == 0, done.stderr
+    assert told_errors(bag)["odometry"] == {
+        "velocity_mps": 0.3,
+        "rate_dps": 2,
+        "correlation_s": tau,
+    }
+    true, said = (
+        [matrix(m.pose.pose.position, m.pose.pose.orientation) for m in read(bag, topic)]
+        for topic in ("/truth/poses", "/zio/odometry/rear")
+    )
+    assert np.allclose(true[0], said[0])
+    values = []
+    for k in range(1, len(true)):
+        step, believed = (np.linalg.inv(T[k - 1]) @ T[k] for T in (true, said))
+        turn = cv2.Rodrigues(step[:3, :3].T @ believed[:3, :3])[0][:, 0]
+        values.append(np.r_[believed[:3, 3] - step[:3, 3], turn] / 0.01)
+    values = np.array(values)  # (readings - 1, 6)
+    assert len(values) == 100
+    kept = np.exp(-0.01 / tau)
+    # Of 300 values with correlation k, the spread of the deviation is that of
+    # 300 (1 - k^2) / (1 + k^2) independent ones; four of its standard deviations.
+    independent = 300 * (1 - kept**2) / (1 + kept**2)
+    for part, size in ((values[:, :3], 0.3), (values[:, 3:], np.radians(2))):
+        assert abs(np.sqrt(np.mean(part**2)) / size - 1) < 4 / np.sqrt(2 * independent)
+        following = np.mean(part[1:] * part[:-1]) / np.mean(part**2)
+        assert abs(following - kept) < 4 / np.sqrt(297)
+
+
+def test_a_place_is_taken_for_the_same_again(noisy_bag):
+    """From one scan to the next, 1 m on, most of what is wrong stays wrong: a real network's
+    correlation is 0.7, that of errors drawn anew for each picture 0.1."""
+    names, labels_seen = network_errors.class_names(), {}
+    errors = network_errors.Errors(names)
+    for labels, scores in network_errors.from_bag(noisy_bag, None, labels_seen):
+        errors.add(labels, scores)
+    again = network_errors.persistence(network_errors.SeenDrive(noisy_bag, labels_seen), names)
+    assert 0.55 < again[1]["correlation"] < 0.85
+    assert again[1]["changed"] < 0.2
+    # Its confidence is that of ENet on labelled photos (0.10, 0.67, 0.925), as far as one short
+    # drive tells.
+    assert 0.06 < errors.reliability.ece < 0.14
+    assert 0.4 < errors.reliability.nll < 0.95
+    assert 0.85 < np.median(np.concatenate(errors.wrong_claims)) < 0.96
 
 
 def test_edge_distance_is_that_of_the_label_image(exact_bag):
@@ -303,6 +418,11 @@ def test_wrong_command_lines_are_named(tmp_path):
         (["--duration", "x"], ["--duration", "'x'"]),
         (["--images", "some"], ["--images", "'some'"]),
         (["--image-choice", "best"], ["--image-choice", "'best'", "closest_to_sweep"]),
+        (["--readout", "1"], ["--readout", "'1'", "0 to 0.1"]),
+        (["--shutter-direction", "in"], ["--shutter-direction", "'in'", "down, up, right, left"]),
+        (["--stamp-row", "2"], ["--stamp-row", "'2'", "first, middle, last"]),
+        (["--extrinsic-error", "1"], ["--extrinsic-error", "'1'", "2 numbers"]),
+        (["--odometry-error", "1,1,0"], ["--odometry-error", "correlation time"]),
         (["--nonsense"], ["--nonsense"]),
         (["--seed"], ["--seed", "value"]),
     ):
