@@ -296,6 +296,10 @@ cv::Mat colorImage(const sensor_msgs::ImageConstPtr& message) {
 
 cv::Mat decodedImage(const sensor_msgs::CompressedImage& message) {
   if (message.data.empty()) throw DataError("compressed image is empty");
+  if (jpegIsCutOff(message.data)) {
+    throw DataError("compressed image of format '" + message.format + "', " +
+                    std::to_string(message.data.size()) + " bytes: the JPEG ends too early");
+  }
   cv::Mat image = decodedJpeg(message.data);
   if (!image.empty()) return image;
   try {

@@ -37,4 +37,16 @@ cv::Mat decodedJpeg(const std::vector<std::uint8_t>&) { return {}; }
 
 #endif
 
+bool jpegIsCutOff(const std::vector<std::uint8_t>& data) {
+  constexpr std::uint8_t kMarker = 0xFF, kStart = 0xD8, kScan = 0xDA, kEnd = 0xD9;
+  if (data.size() < 2 || data[0] != kMarker || data[1] != kStart) return false;
+  // No marker of a thumbnail comes after the last scan begins, and none lies in its data.
+  for (std::size_t i = data.size() - 1; i > 0; --i) {
+    if (data[i - 1] != kMarker) continue;
+    if (data[i] == kEnd) return false;
+    if (data[i] == kScan) break;
+  }
+  return true;
+}
+
 }  // namespace semantic_lidar_fusion

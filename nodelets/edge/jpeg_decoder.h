@@ -13,4 +13,8 @@ namespace semantic_lidar_fusion {
 /// libjpeg-turbo: then cv::imdecode is to judge.
 cv::Mat decodedJpeg(const std::vector<std::uint8_t>& data);
 
+/// Whether a JPEG ends before its end marker. libjpeg and the versions of OpenCV fill what is
+/// missing in different ways, some with whatever the memory holds.
+bool jpegIsCutOff(const std::vector<std::uint8_t>& data);
+
 }  // namespace semantic_lidar_fusion

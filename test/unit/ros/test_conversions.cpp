@@ -12,6 +12,7 @@
 #include <random>
 
 #include "edge/conversions.h"
+#include "edge/jpeg_decoder.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {
@@ -254,19 +255,42 @@ TEST(DecodedImage, ReadsJpegAsOpencvDoes) {
 }
 
 /// Whatever is not a whole JPEG goes the way of other formats, and ends as it does there.
-TEST(DecodedImage, DamagedJpegIsOpencvsToJudge) {
+TEST(DecodedImage, JpegThatEndsTooEarlyIsRefused) {
   cv::Mat picture(64, 48, CV_8UC3);
   cv::RNG(5).fill(picture, cv::RNG::UNIFORM, 0, 256);
   sensor_msgs::CompressedImage whole;
   cv::imencode(".jpg", picture, whole.data);
+  const cv::Mat expected = cv::imdecode(whole.data, cv::IMREAD_UNCHANGED);
   for (std::size_t length = 1; length < whole.data.size(); length += 37) {
     sensor_msgs::CompressedImage cut = whole;
     cut.data.resize(length);
-    const cv::Mat expected = cv::imdecode(cut.data, cv::IMREAD_UNCHANGED);
-    if (expected.empty()) {
-      EXPECT_THROW(decodedImage(cut), DataError) << length;
+    EXPECT_THROW(decodedImage(cut), DataError) << length;
+  }
+  // An end marker of a thumbnail, before the scan, does not help; padding does no harm.
+  sensor_msgs::CompressedImage thumbnail = whole;
+  const std::uint8_t comment[] = {0xFF, 0xFE, 0x00, 0x04, 0xFF, 0xD9};
+  thumbnail.data.insert(thumbnail.data.begin() + 2, std::begin(comment), std::end(comment));
+  EXPECT_EQ(cv::norm(decodedImage(thumbnail), expected, cv::NORM_INF), 0.0);
+  thumbnail.data.resize(thumbnail.data.size() - 2);
+  EXPECT_THROW(decodedImage(thumbnail), DataError);
+  sensor_msgs::CompressedImage padded = whole;
+  padded.data.insert(padded.data.end(), 100, 0);
+  EXPECT_EQ(cv::norm(decodedImage(padded), expected, cv::NORM_INF), 0.0);
+}
+
+TEST(DecodedImage, JpegOfDamagedDataIsOpencvsToJudge) {
+  cv::Mat picture(64, 48, CV_8UC3);
+  cv::RNG(5).fill(picture, cv::RNG::UNIFORM, 0, 256);
+  sensor_msgs::CompressedImage whole;
+  cv::imencode(".jpg", picture, whole.data);
+  for (std::size_t at = 700; at + 2 < whole.data.size(); at += 97) {
+    sensor_msgs::CompressedImage damaged = whole;
+    damaged.data[at] = static_cast<std::uint8_t>(damaged.data[at] ^ 0x10U);
+    const cv::Mat expected = cv::imdecode(damaged.data, cv::IMREAD_UNCHANGED);
+    if (jpegIsCutOff(damaged.data) || expected.empty()) {
+      EXPECT_THROW(decodedImage(damaged), DataError) << at;
     } else {
-      EXPECT_EQ(cv::norm(decodedImage(cut), expected, cv::NORM_INF), 0.0) << length;
+      EXPECT_EQ(cv::norm(decodedImage(damaged), expected, cv::NORM_INF), 0.0) << at;
     }
   }
 }
