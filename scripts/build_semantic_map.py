@@ -10,24 +10,23 @@ import sys
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
 from semantic_lidar_fusion import cli  # noqa: E402
+from semantic_lidar_fusion.maps import formats  # noqa: E402
 
-FORMATS = ("ply", "pcd", "npz", "octomap", "grid", "raster", "picture")
 EPILOG = """\
 INPUT is a bag with points_semantic (and class_info), as fuse_bag writes it, or a map.voxels of an
 earlier run with the same options, which is added. Poses come from tf at each cloud's stamp,
-interpolated; fused bags hold no tf, so name the bags that do:
+interpolated; fused bags hold no tf, so name the bags that do; or from files of corrected poses:
 
   build_semantic_map.py fused.bag --tf drive.bag --out map
   build_semantic_map.py monday.bag tuesday.bag --tf monday_raw.bag tuesday_raw.bag --out map --workers 4
+  build_semantic_map.py fused.bag --poses slam.tum --poses-frame base_link --tf drive.bag --out map
   build_semantic_map.py fused.bag --tf drive.bag --out map --scheduler tcp://10.0.0.5:8786
   build_semantic_map.py --live points_semantic --out map        (Ctrl-C ends it and writes the map)
   build_semantic_map.py a/map.voxels b/map.voxels --out both
 
-Written to --out: map.voxels (the map itself), map.json (what it is), map.ply, map.pcd, map.npz, map.ot
-and map.bt (OctoMap), costs.pgm/.yaml and occupancy.pgm/.yaml (map_server), classes, labels, confidence
-and elevation as PNG with world files, and map.png; dynamic.ply and dynamic.pcd hold what moves. The
-folder is there whole or not at all. Exit codes: 0 done; 1 failed; 2 wrong command line; 130
-interrupted."""
+Written to --out: map.voxels (the map itself, first of all), map.json (what it is), and the --formats.
+A format that fails is left out with a warning, and the exit code is 1; the rest is there. Without
+map.voxels there is no folder. Exit codes: 0 done; 1 failed; 2 wrong command line; 130 interrupted."""
 
 
 def make_parser():
@@ -56,7 +55,32 @@ def make_parser():
         metavar="NAME,...",
         type=_formats,
         default=None,
-        help="of %s (default: all that can be written here)" % ", ".join(FORMATS),
+        help="of %s (default: all that can be written here)" % ", ".join(formats.names()),
+    )
+    parser.add_argument(
+        "--poses", metavar="FILE", nargs="+", default=[], help="poses to take instead of tf, one file "
+        "for each bag: TUM (stamp x y z qx qy qz qw), or KITTI (3 x 4 matrices, one for each cloud)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--poses-frame",
+        metavar="NAME",
+        default="",
+        help="the frame of tf whose poses --poses holds (default: that of the clouds)",
+    )
+    parser.add_argument(
+        "--vehicle-frame",
+        metavar="NAME",
+        default="base_link",
+        help="the frame along whose path the ground is free (default: base_link, or the clouds')",
+    )
+    parser.add_argument(
+        "--epsg", metavar="CODE", type=cli.positive, help="coordinate system of the map, for GIS"
+    )
+    parser.add_argument(
+        "--scan-labels",
+        action="store_true",
+        help="also write labels/000000.label, ...: the map's class for each point of each cloud, with "
+        "the ids of SemanticKITTI",
     )
     model = parser.add_argument_group("the map")
     model.add_argument("--voxel", metavar="M", type=float, default=0.2, help="edge (default: 0.2)")
@@ -84,13 +108,32 @@ def make_parser():
         "--min-range", metavar="M", type=float, default=0.0, help="from the lidar (default: none)"
     )
     model.add_argument(
-        "--max-range", metavar="M", type=float, default=0.0, help="from the lidar (default: none)"
+        "--max-range",
+        metavar="M",
+        type=float,
+        default=120.0,
+        help="from the lidar, 0 = no limit (default: 120)",
+    )
+    model.add_argument(
+        "--rays",
+        metavar="M",
+        type=float,
+        default=45.0,
+        help="how far from the lidar its rays clear what is no longer there, 0 = never (default: 45)",
+    )
+    model.add_argument(
+        "--footprint",
+        metavar="M",
+        type=float,
+        default=0.9,
+        help="half the width of the vehicle, whose path is free in 2-D maps, 0 = it is not "
+        "(default: 0.9)",
     )
     model.add_argument(
         "--dynamic",
         choices=["apart", "exclude", "keep"],
         default="apart",
-        help="points of classes that move by themselves: a layer of their own, none, or like all "
+        help="voxels of classes that move by themselves: a layer of their own, none, or like all "
         "others (default: apart)",
     )
     model.add_argument(
@@ -121,11 +164,10 @@ def make_parser():
 
 
 def _formats(text):
-    chosen = [name for name in text.split(",") if name]
-    wrong = sorted(set(chosen) - set(FORMATS))
-    if wrong:
-        raise argparse.ArgumentTypeError("no format %s (of %s)" % (wrong[0], ", ".join(FORMATS)))
-    return chosen
+    try:
+        return tuple(formats.split(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error))
 
 
 def _prior(text):
@@ -145,8 +187,12 @@ def check(parser, options):
     """Leaves with exit code 2 unless the options fit together."""
     if bool(options.inputs) == bool(options.live):
         parser.error("give INPUT files or --live, one of them")
-    if options.live and (options.tf or options.workers > 1 or options.scheduler):
-        parser.error("--live excludes --tf, --workers and --scheduler")
+    if options.scan_labels and not [p for p in options.inputs if not p.endswith(".voxels")]:
+        parser.error("--scan-labels needs bags")
+    if options.scheduler is not None and not options.scheduler.strip():
+        parser.error("--scheduler: must be an address, such as tcp://10.0.0.5:8786")
+    if options.live and (options.tf or options.poses or options.workers > 1 or options.scheduler):
+        parser.error("--live excludes --tf, --poses, --workers and --scheduler")
     if options.duration is not None and not options.live:
         parser.error("--duration needs --live")
     if options.workers > 1 and options.scheduler:
@@ -154,6 +200,58 @@ def check(parser, options):
     bags = [path for path in options.inputs if not path.endswith(".voxels")]
     if options.tf and len(bags) != 1 and len(options.tf) != len(bags):
         parser.error("--tf: give one bag for each input (%d), in their order" % len(bags))
+    if options.poses and len(options.poses) != len(bags):
+        parser.error("--poses: give one file for each bag (%d), in their order" % len(bags))
+    if options.poses_frame and not options.poses:
+        parser.error("--poses-frame needs --poses")
+
+
+def request_of(options):
+    """The options as what `run.build` takes."""
+    from semantic_lidar_fusion.maps.build import Work
+    from semantic_lidar_fusion.maps.run import Request
+    from semantic_lidar_fusion.maps.semantic_map import MapConfig
+
+    defaults = MapConfig()
+
+    def given(value, default):
+        return default if value is None else value
+
+    config = MapConfig(
+        voxel_size_m=options.voxel,
+        kind=options.evidence,
+        weight=given(options.weight, defaults.weight),
+        floor=given(options.floor, defaults.floor),
+        clamp=given(options.clamp, defaults.clamp),
+        min_range_m=options.min_range,
+        max_range_m=options.max_range,
+        ray_range_m=options.rays,
+        dynamic=options.dynamic,
+        footprint_m=options.footprint,
+    )
+    return Request(
+        out=options.out,
+        inputs=tuple(options.inputs),
+        live=options.live or "",
+        duration=options.duration,
+        overwrite=options.overwrite,
+        formats=options.formats,
+        epsg=options.epsg,
+        scan_labels=options.scan_labels,
+        tf=tuple(options.tf),
+        topic=options.topic,
+        odometry=options.odometry,
+        poses=tuple(options.poses),
+        poses_frame=options.poses_frame,
+        vehicle_frame=options.vehicle_frame,
+        frame=options.frame or "",
+        classes=options.classes or "",
+        costs=options.costs or "",
+        prior=tuple(options.prior.items()),
+        config=config,
+        work=Work(options.workers, options.scheduler),
+        memory_mb=options.memory,
+    )
 
 
 def main():
@@ -163,7 +261,9 @@ def main():
     cli.require("numpy", "yaml", "rosbag", "scipy", "matplotlib", "cv2")
     from semantic_lidar_fusion.maps import run
 
-    print(run.build(options))
+    text, complete = run.build(request_of(options))
+    print(text)
+    return 0 if complete else 1
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ py::array asArray(std::vector<std::uint8_t>&& bytes) {
 
 VoxelMapConfig makeConfig(double voxel_size_m, bool dirichlet, double weight, double floor,
                           const std::vector<double>& prior, double min_range_m, double max_range_m,
-                          const std::vector<std::uint8_t>& dynamic, const std::string& points) {
+                          double ray_range_m, const std::vector<std::uint8_t>& returns) {
   VoxelMapConfig config;
   config.voxel_size_m = voxel_size_m;
   config.evidence.kind = dirichlet ? EvidenceKind::kDirichlet : EvidenceKind::kLog;
@@ -48,18 +48,16 @@ VoxelMapConfig makeConfig(double voxel_size_m, bool dirichlet, double weight, do
   config.evidence.prior = prior;
   config.min_range_m = min_range_m;
   config.max_range_m = max_range_m;
-  config.dynamic = dynamic;
-  config.dynamic_points = points == "apart"     ? DynamicPoints::kApart
-                          : points == "exclude" ? DynamicPoints::kExclude
-                                                : DynamicPoints::kKeep;
+  config.ray_range_m = ray_range_m;
+  config.returns = returns;
   return config;
 }
 
 std::vector<std::size_t> integrate(VoxelMap* map, const py::array& x, const py::array& y,
                                    const py::array& z, const py::array& intensity,
-                                   const py::array& status, const py::array& label,
-                                   const py::array& probabilities, const py::array& pose,
-                                   StampNs stamp_ns) {
+                                   const py::array& status, const py::array& probabilities,
+                                   const py::array& pose, StampNs stamp_ns,
+                                   const py::array& origins) {
   SemanticPoints points;
   points.count = static_cast<std::size_t>(checked<float>(x, 1, "x").shape(0));
   points.x = column(x);
@@ -67,15 +65,21 @@ std::vector<std::size_t> integrate(VoxelMap* map, const py::array& x, const py::
   points.z = column(checked<float>(z, 1, "z"));
   points.intensity = column(checked<float>(intensity, 1, "intensity"));
   points.status = column(checked<std::uint8_t>(status, 1, "status"));
-  points.label = column(checked<std::uint8_t>(label, 1, "label"));
   points.probabilities = column(checked<float>(probabilities, 2, "probabilities"));
-  for (const py::array* values : {&y, &z, &intensity, &status, &label, &probabilities}) {
+  for (const py::array* values : {&y, &z, &intensity, &status, &probabilities}) {
     if (static_cast<std::size_t>(values->shape(0)) != points.count)
       throw py::value_error("columns of different lengths");
   }
   if (probabilities.shape(1) != map->classCount() ||
       (map->classCount() > 1 && probabilities.strides(1) != sizeof(float)))
     throw py::value_error("probabilities: as many adjacent columns as the map has classes");
+  const auto from = checked<double>(origins, 2, "origins")
+                        .cast<py::array_t<double, py::array::c_style | py::array::forcecast>>();
+  if (from.shape(0) != 0) {
+    if (static_cast<std::size_t>(from.shape(0)) != points.count || from.shape(1) != 3)
+      throw py::value_error("origins: must be (N, 3), or empty");
+    points.origins = from.data();
+  }
   const auto matrix = checked<double>(pose, 2, "pose").cast<py::array_t<double>>();
   if (matrix.shape(0) != 4 || matrix.shape(1) != 4) throw py::value_error("pose: must be 4 x 4");
   Transform T_map_lidar = Transform::Identity();
@@ -87,12 +91,16 @@ std::vector<std::size_t> integrate(VoxelMap* map, const py::array& x, const py::
     const py::gil_scoped_release release;
     counts = map->integrate(points, T_map_lidar, stamp_ns);
   }
-  return {counts.labelled,     counts.occupied, counts.no_odometry,
-          counts.out_of_range, counts.excluded, counts.invalid};
+  return {counts.labelled, counts.occupied, counts.no_odometry, counts.out_of_range,
+          counts.invalid};
 }
 
-void add(VoxelMap* map, const py::array_t<std::uint8_t, py::array::c_style>& records) {
-  map->add(records.data(), static_cast<std::size_t>(records.size()));
+using Indices = py::array_t<std::int64_t, py::array::c_style>;
+using Bytes = py::array_t<std::uint8_t, py::array::c_style>;
+
+void add(VoxelMap* map, const Bytes& records, const Bytes& bricks) {
+  map->add(records.data(), static_cast<std::size_t>(records.size()), bricks.data(),
+           static_cast<std::size_t>(bricks.size()));
 }
 
 }  // namespace
@@ -105,26 +113,27 @@ PYBIND11_MODULE(_voxel_map, module) {
   py::class_<VoxelMap>(module, "VoxelMap")
       .def(py::init([](double voxel_size_m, bool dirichlet, double weight, double floor,
                        const std::vector<double>& prior, double min_range_m, double max_range_m,
-                       const std::vector<std::uint8_t>& dynamic, const std::string& points) {
+                       double ray_range_m, const std::vector<std::uint8_t>& returns) {
         return new VoxelMap(makeConfig(voxel_size_m, dirichlet, weight, floor, prior, min_range_m,
-                                       max_range_m, dynamic, points));
+                                       max_range_m, ray_range_m, returns));
       }))
       .def("__len__", &VoxelMap::size)
       .def_property_readonly("memory_bytes", &VoxelMap::memoryBytes)
       .def("integrate", &integrate)
       .def("add", &add)
       .def("records", [](const VoxelMap& map, bool sorted) { return asArray(map.records(sorted)); })
+      .def("bricks", [](const VoxelMap& map, bool sorted) { return asArray(map.bricks(sorted)); })
       .def("keep_inside", &VoxelMap::keepInside)
       .def("clear", &VoxelMap::clear);
   module.attr("has_octomap") = hasOctomap();
-  module.def("write_octomap",
-             [](const py::array_t<double, py::array::c_style>& xyz,
-                const py::array_t<std::uint8_t, py::array::c_style>& rgb, double size,
-                const std::string& color_path, const std::string& binary_path) {
-               if (xyz.ndim() != 2 || rgb.ndim() != 2 || xyz.shape(1) != 3 || rgb.shape(1) != 3 ||
-                   xyz.shape(0) != rgb.shape(0))
-                 throw py::value_error("xyz and rgb: must be (N, 3) of the same N");
-               writeOctomap(xyz.data(), rgb.data(), static_cast<std::size_t>(xyz.shape(0)), size,
-                            color_path, binary_path);
-             });
+  module.def("write_octomap", [](const Indices& occupied, const Bytes& rgb, const Indices& free,
+                                 double size, const std::string& color_path,
+                                 const std::string& binary_path) {
+    if (occupied.ndim() != 2 || rgb.ndim() != 2 || free.ndim() != 2 || occupied.shape(1) != 3 ||
+        rgb.shape(1) != 3 || free.shape(1) != 3 || occupied.shape(0) != rgb.shape(0))
+      throw py::value_error("occupied, rgb and free: must be (N, 3), (N, 3) and (M, 3)");
+    writeOctomap({occupied.data(), static_cast<std::size_t>(occupied.shape(0))}, rgb.data(),
+                 {free.data(), static_cast<std::size_t>(free.shape(0))}, size, color_path,
+                 binary_path);
+  });
 }

@@ -2,7 +2,7 @@
 """Class ids, names and colours as one table, read from the class-set YAML files in config/.
 
 The format is that of semantic_lidar_fusion/common/label_set.h: `classes`, a list of {name,
-color: [r, g, b], dynamic} whose position is the class id, and `evaluation: {discard: [names],
+color: [r, g, b], dynamic, lidar} whose position is the class id, and `evaluation: {discard: [names],
 merge: {merged_name: [names]}}`.
 """
 
@@ -20,6 +20,8 @@ __all__ = ["ClassInfo", "LabelSet", "MergedClass", "load_yaml", "package_file", 
 
 NO_LABEL = 255  # label of a point without a class
 MAX_CLASSES = 255
+# Classes with these names are none that a lidar's return can be of, unless the set says otherwise.
+NO_RETURN_NAMES = ("sky", "unlabeled", "unlabelled", "void")
 _NAME = re.compile(r"[a-z0-9_]{1,64}\Z")
 _NAME_RULE = "must be 1 to 64 characters of a-z, 0-9 and _"
 
@@ -30,6 +32,11 @@ class ClassInfo(NamedTuple):
     name: str
     color_rgb: Tuple[int, int, int]
     dynamic: bool
+    lidar: Optional[bool] = None  # a return can be of it; None = by its name
+
+    @property
+    def returns(self) -> bool:
+        return self.name not in NO_RETURN_NAMES if self.lidar is None else self.lidar
 
 
 class MergedClass(NamedTuple):
@@ -84,6 +91,8 @@ class LabelSet:
             entry: Dict[str, Any] = {"id": i, "name": info.name, "color": list(info.color_rgb)}
             if info.dynamic:
                 entry["dynamic"] = True
+            if info.lidar is not None:
+                entry["lidar"] = info.lidar
             classes.append(entry)
         result: Dict[str, Any] = {"classes": classes}
         evaluation: Dict[str, Any] = {}
@@ -104,7 +113,15 @@ class LabelSet:
         return self.classes[class_id]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, LabelSet) and self.tree() == other.tree()
+        if not isinstance(other, LabelSet):
+            return False
+        # Whether `lidar` is written out or follows from the name makes no difference.
+        same = [a._replace(lidar=a.returns) for a in self.classes] == [
+            b._replace(lidar=b.returns) for b in other.classes
+        ]
+        return same and (
+            (self.discarded, sorted(self.merged)) == (other.discarded, sorted(other.merged))
+        )
 
     def id_of(self, name: str) -> Optional[int]:
         """The id of a class name, or None."""
@@ -118,6 +135,12 @@ class LabelSet:
     def colors_rgb(self) -> np.ndarray:
         """(C, 3) uint8."""
         return np.array([info.color_rgb for info in self.classes], dtype=np.uint8)
+
+    @property
+    def returns(self) -> np.ndarray:
+        """(C,) bool: whether a lidar's return can be of the class; all, if it can be of none."""
+        result = np.array([info.returns for info in self.classes], dtype=bool)
+        return result if result.any() else ~result
 
     @property
     def dynamic_ids(self) -> List[int]:
@@ -215,7 +238,7 @@ def _class_from_tree(entry: Any, index: int, problems: List[str]) -> ClassInfo:
     if not isinstance(entry, dict):
         problems.append("%s = %s: must be a mapping" % (path, entry))
         return ClassInfo("", (0, 0, 0), False)
-    problems += _unknown_keys(entry, ("id", "name", "color", "dynamic"), path + ".")
+    problems += _unknown_keys(entry, ("id", "name", "color", "dynamic", "lidar"), path + ".")
     name, color = entry.get("name"), entry.get("color")
     dynamic = entry.get("dynamic", False)
     if not isinstance(name, str) or not _NAME.match(name):
@@ -237,7 +260,11 @@ def _class_from_tree(entry: Any, index: int, problems: List[str]) -> ClassInfo:
     if not isinstance(dynamic, bool):
         problems.append("%s.dynamic = %s: must be true or false" % (path, dynamic))
         dynamic = False
-    return ClassInfo(name, (color[0], color[1], color[2]), dynamic)
+    lidar = entry.get("lidar")
+    if lidar is not None and not isinstance(lidar, bool):
+        problems.append("%s.lidar = %s: must be true or false" % (path, lidar))
+        lidar = None
+    return ClassInfo(name, (color[0], color[1], color[2]), dynamic, lidar)
 
 
 def _from_tree(tree: Any, problems: List[str]) -> LabelSet:

@@ -47,6 +47,11 @@ ClassInfo readClass(const YAML::Node& node, std::size_t index, std::vector<std::
   }
 
   section.boolean("dynamic", &info.dynamic);
+  if (section.has("lidar")) {
+    bool lidar = true;
+    section.boolean("lidar", &lidar);
+    info.lidar = lidar;
+  }
   section.finish();
   return info;
 }
@@ -176,7 +181,9 @@ std::string LabelSet::toJson() const {
     appendJson(info.name, &json);
     json += ", \"color\": [" + std::to_string(info.color_rgb[0]) + ", " +
             std::to_string(info.color_rgb[1]) + ", " + std::to_string(info.color_rgb[2]) +
-            "], \"dynamic\": " + (info.dynamic ? "true" : "false") + "}";
+            "], \"dynamic\": " + (info.dynamic ? "true" : "false");
+    if (info.lidar) json += std::string(", \"lidar\": ") + (*info.lidar ? "true" : "false");
+    json += "}";
   }
   const auto appendNames = [&](const std::vector<int>& ids) {
     json += "[";

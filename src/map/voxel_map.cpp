@@ -20,6 +20,10 @@ constexpr std::size_t kMaxLoad[2] = {3, 4};  // 3/4 of the slots
 constexpr double kIntensityUnit = 1048576.0;
 constexpr float kMaxIntensity = 1e6f;
 constexpr std::size_t kPointsAhead = 24;  // to fetch into the cache
+constexpr float kProbabilityUnit = 1048576.0f;
+// A look whose points are, but for this share, of classes that no return can be of says nothing.
+constexpr double kLeastShare = 1e-3;
+constexpr double kMaxVoxel = 536870912.0;  // as in the kernels
 
 template <typename Value>
 Value valueAt(const Column& column, std::size_t row) {
@@ -37,10 +41,6 @@ inline std::int64_t floorOf(double value) {
 std::uint64_t packXy(std::int32_t x, std::int32_t y) {
   return static_cast<std::uint64_t>(static_cast<std::uint32_t>(x)) << 32 |
          static_cast<std::uint32_t>(y);
-}
-
-std::uint32_t packZ(std::int32_t z, std::uint32_t layer) {
-  return static_cast<std::uint32_t>(z) << 1 | layer;
 }
 
 std::uint32_t saturatingSum(std::uint32_t a, std::uint32_t b) {
@@ -67,7 +67,7 @@ bool copyFinite(const std::uint8_t* from, int count, float* to) {
 /// Canonical order; see VoxelMap::records.
 bool isBefore(const VoxelHeader& a, const VoxelHeader& b) {
   const auto key = [](const VoxelHeader& v) {
-    return std::make_tuple(VoxelMap::tileOf(v.x), VoxelMap::tileOf(v.y), v.layer, v.x, v.y, v.z);
+    return std::make_tuple(VoxelMap::tileOf(v.x), VoxelMap::tileOf(v.y), v.x, v.y, v.z);
   };
   return key(a) < key(b);
 }
@@ -83,8 +83,13 @@ void check(const VoxelMapConfig& config) {
   if (!(config.max_range_m >= 0.0)) problem("max_range_m", config.max_range_m, "0 or more");
   if (config.max_range_m > 0.0 && config.max_range_m <= config.min_range_m)
     problem("max_range_m", config.max_range_m, "0 or above min_range_m");
-  if (!config.dynamic.empty() && config.dynamic.size() != config.evidence.prior.size())
-    problem("dynamic", static_cast<double>(config.dynamic.size()), "of as many classes as prior");
+  if (!(config.ray_range_m >= 0.0 && config.ray_range_m <= 1e4))
+    problem("ray_range_m", config.ray_range_m, "from 0 to 10000");
+  if (!config.returns.empty() && config.returns.size() != config.evidence.prior.size())
+    problem("returns", static_cast<double>(config.returns.size()), "of as many classes as prior");
+  if (!config.returns.empty() && std::count(config.returns.begin(), config.returns.end(), 0) ==
+                                     static_cast<std::ptrdiff_t>(config.returns.size()))
+    problem("returns", 0.0, "1 for one class at least");
   if (!problems.empty()) throw ConfigError(problems);
 }
 
@@ -98,16 +103,17 @@ struct VoxelMap::Batch {
   PlacedPoints placed = {};
   std::int64_t intensity[kSize];
   const std::uint8_t* probabilities[kSize];  ///< null = occupied only
-  std::uint32_t layer[kSize];
+  const double* origins[kSize];              ///< null = the pose's
 };
 
 VoxelMap::VoxelMap(const VoxelMapConfig& config)
     : config_(config),
       evidence_(config.evidence),
       add_evidence_(addEvidence()),
-      place_points_(placePoints()) {
+      place_points_(placePoints()),
+      quantise_(countEvidence()) {
   check(config_);
-  if (config_.dynamic.empty()) config_.dynamic.assign(config_.evidence.prior.size(), 0);
+  if (config_.returns.empty()) config_.returns.assign(config_.evidence.prior.size(), 1);
   words_ = kHeaderWords + static_cast<std::size_t>(evidence_.classCount());
   const std::size_t values = EvidenceModel::kMaxRows * config_.evidence.prior.size();
   rows_.resize(values);
@@ -122,6 +128,8 @@ void VoxelMap::clear() {
   slots_.shrink_to_fit();
   chunks_.clear();
   blocks_.clear();
+  free_.clear();
+  look_of_record_.clear();
 }
 
 std::size_t VoxelMap::memoryBytes() const {
@@ -131,18 +139,19 @@ std::size_t VoxelMap::memoryBytes() const {
     bytes += bytesOfBlock(count);
     chunk += count;
   }
-  return bytes;
+  bytes += look_of_record_.capacity() * sizeof(std::uint32_t);
+  return bytes + free_.memoryBytes();
 }
 
-inline std::uint64_t VoxelMap::hashOf(std::uint64_t xy, std::uint32_t z_layer) {
+inline std::uint64_t VoxelMap::hashOf(std::uint64_t xy, std::uint32_t z) {
   std::uint64_t hash = (xy ^ (xy >> 29)) * 0x9e3779b97f4a7c15ULL;
-  hash = (hash ^ (hash >> 32) ^ z_layer) * 0xbf58476d1ce4e5b9ULL;
+  hash = (hash ^ (hash >> 32) ^ z) * 0xbf58476d1ce4e5b9ULL;
   return hash ^ (hash << 21);
 }
 
 inline void VoxelMap::place(const Slot& slot) {
   const std::size_t mask = slots_.size() - 1;
-  std::size_t at = hashOf(slot.xy, slot.z_layer) >> shift_;
+  std::size_t at = hashOf(slot.xy, slot.z) >> shift_;
   while (slots_[at].index != 0) at = (at + 1) & mask;
   slots_[at] = slot;
 }
@@ -173,13 +182,22 @@ void VoxelMap::addBlock() {
   for (std::size_t i = 0; i < count; ++i) chunks_.push_back(blocks_.back().get() + i * words);
 }
 
-inline std::int64_t* VoxelMap::findOrMake(std::uint64_t xy, std::uint32_t z_layer,
-                                          std::uint64_t hash) {
+std::int64_t* VoxelMap::find(const VoxelKey& voxel) {
+  const std::uint64_t xy = packXy(voxel[0], voxel[1]);
+  const auto z = static_cast<std::uint32_t>(voxel[2]);
+  const std::size_t mask = slots_.size() - 1;
+  for (std::size_t at = hashOf(xy, z) >> shift_; slots_[at].index != 0; at = (at + 1) & mask) {
+    if (slots_[at].xy == xy && slots_[at].z == z) return record(slots_[at].index - 1);
+  }
+  return nullptr;
+}
+
+inline std::uint32_t VoxelMap::findOrMake(std::uint64_t xy, std::uint32_t z, std::uint64_t hash) {
   const std::size_t mask = slots_.size() - 1;
   std::size_t at = hash >> shift_;
   for (; slots_[at].index != 0; at = (at + 1) & mask) {
     const Slot& slot = slots_[at];
-    if (slot.xy == xy && slot.z_layer == z_layer) return record(slot.index - 1);
+    if (slot.xy == xy && slot.z == z) return slot.index - 1;
   }
   if (size_ >= std::numeric_limits<std::uint32_t>::max() - 1)
     throw DataError("voxel map: more than 2^32 voxels; use larger ones, or more tiles");
@@ -189,13 +207,14 @@ inline std::int64_t* VoxelMap::findOrMake(std::uint64_t xy, std::uint32_t z_laye
   VoxelHeader* const voxel = header(made);
   voxel->x = static_cast<std::int32_t>(xy >> 32);
   voxel->y = static_cast<std::int32_t>(xy & 0xffffffffU);
-  voxel->z = static_cast<std::int32_t>(z_layer) >> 1;
-  voxel->layer = z_layer & 1U;
+  voxel->z = static_cast<std::int32_t>(z);
   voxel->first_ns = std::numeric_limits<std::int64_t>::max();
   voxel->last_ns = std::numeric_limits<std::int64_t>::min();
-  slots_[at] = Slot{xy, z_layer, static_cast<std::uint32_t>(++size_)};
+  if (config_.ray_range_m > 0.0) voxel->passes = free_.claim({voxel->x, voxel->y, voxel->z});
+  voxel->passes_after = voxel->passes;
+  slots_[at] = Slot{xy, z, static_cast<std::uint32_t>(++size_)};
   if (size_ * kMaxLoad[1] > slots_.size() * kMaxLoad[0]) grow();
-  return made;
+  return static_cast<std::uint32_t>(size_ - 1);
 }
 
 IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transform& T_map_lidar,
@@ -209,7 +228,9 @@ IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transf
   const double least = config_.min_range_m * config_.min_range_m;
   const double most = config_.max_range_m > 0.0 ? config_.max_range_m * config_.max_range_m
                                                 : std::numeric_limits<double>::infinity();
-  const std::size_t classes = config_.dynamic.size();
+  looks_.clear();
+  look_sums_.clear();
+  rays_.clear();
   Batch batch;
   for (std::size_t i = 0; i < points.count; ++i) {
     // A point takes one or two cache lines of its message.
@@ -227,7 +248,7 @@ IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transf
     const float z = valueAt<float>(points.z, i);
     const double squared_range =
         static_cast<double>(x) * x + static_cast<double>(y) * y + static_cast<double>(z) * z;
-    if (!(squared_range <= std::numeric_limits<double>::max())) {
+    if (!(squared_range > 0.0 && squared_range <= std::numeric_limits<double>::max())) {
       ++counts.invalid;
       continue;
     }
@@ -235,113 +256,216 @@ IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transf
       ++counts.out_of_range;
       continue;
     }
-    batch.layer[row] = 0;
     batch.probabilities[row] = nullptr;
     if (status == static_cast<std::uint8_t>(PointStatus::kFused)) {
-      const std::uint8_t label = valueAt<std::uint8_t>(points.label, i);
-      if (label < classes && config_.dynamic[label] != 0) {
-        if (config_.dynamic_points == DynamicPoints::kExclude) {
-          ++counts.excluded;
-          continue;
-        }
-        batch.layer[row] = config_.dynamic_points == DynamicPoints::kApart ? 1 : 0;
-      }
       batch.probabilities[row] =
           points.probabilities.data + static_cast<std::ptrdiff_t>(i) * points.probabilities.stride;
     }
+    batch.origins[row] = points.origins ? points.origins + 3 * i : nullptr;
     float intensity = points.intensity.data ? valueAt<float>(points.intensity, i) : 0.0f;
     if (!(std::abs(intensity) <= kMaxIntensity)) intensity = 0.0f;
     batch.intensity[row] = floorOf(static_cast<double>(intensity) * kIntensityUnit + 0.5);
     batch.placed.x[row] = x;
     batch.placed.y[row] = y;
     batch.placed.z[row] = z;
-    if (++batch.count == Batch::kSize) integrateBatch(pose, stamp, &batch, &counts);
+    if (++batch.count == Batch::kSize) integrateBatch(pose, &batch, &counts);
   }
-  integrateBatch(pose, stamp, &batch, &counts);
+  integrateBatch(pose, &batch, &counts);
+  finishLooks(stamp);
+  castRays();
   return counts;
 }
 
-void VoxelMap::integrateBatch(const PlacementConstants& pose, StampNs stamp, Batch* batch,
+VoxelMap::Look& VoxelMap::lookAt(std::uint32_t record, std::size_t* index) {
+  if (look_of_record_.size() <= record) look_of_record_.resize(chunks_.size() * kChunkSize, 0);
+  *index = look_of_record_[record];
+  if (*index >= looks_.size() || looks_[*index].record != record) {
+    *index = looks_.size();
+    look_of_record_[record] = static_cast<std::uint32_t>(*index);
+    looks_.push_back({record, 0});
+    look_sums_.resize(look_sums_.size() + static_cast<std::size_t>(classCount()), 0);
+  }
+  return looks_[*index];
+}
+
+void VoxelMap::integrateBatch(const PlacementConstants& pose, Batch* batch,
                               IntegrationCounts* counts) {
-  const int classes = evidence_.classCount();
+  const auto classes = static_cast<std::size_t>(evidence_.classCount());
   PlacedPoints& placed = batch->placed;
   std::uint64_t xy[Batch::kSize], hashes[Batch::kSize];
-  std::uint32_t z_layer[Batch::kSize];
-  std::int64_t* records[Batch::kSize];
-  bool has_evidence[Batch::kSize];
-  int labelled = 0;
+  std::uint32_t z[Batch::kSize], found[Batch::kSize];
+  bool has_distribution[Batch::kSize];
+  std::size_t labelled = 0;
   place_points_(pose, &placed);
   for (int i = 0; i < batch->count; ++i) {
     xy[i] = packXy(placed.index[0][i], placed.index[1][i]);
-    z_layer[i] = packZ(placed.index[2][i], batch->layer[i]);
-    hashes[i] = hashOf(xy[i], z_layer[i]);
+    z[i] = static_cast<std::uint32_t>(placed.index[2][i]);
+    hashes[i] = hashOf(xy[i], z[i]);
     __builtin_prefetch(&slots_[hashes[i] >> shift_], 1);
   }
   for (int i = 0; i < batch->count; ++i) {
     if (!placed.inside[i]) continue;
-    records[i] = findOrMake(xy[i], z_layer[i], hashes[i]);
-    const char* const lines = reinterpret_cast<const char*>(records[i]);
-    for (std::size_t byte = 0; byte < recordSize(); byte += 64) __builtin_prefetch(lines + byte, 1);
-    __builtin_prefetch(lines + recordSize() - 1, 1);
-    has_evidence[i] = false;
+    found[i] = findOrMake(xy[i], z[i], hashes[i]);
+    __builtin_prefetch(record(found[i]), 1);
+    has_distribution[i] = false;
     if (!batch->probabilities[i]) continue;
-    has_evidence[i] =
-        copyFinite(batch->probabilities[i], classes, rows_.data() + labelled * classes);
-    labelled += has_evidence[i] ? 1 : 0;
-    counts->invalid += has_evidence[i] ? 0 : 1;
+    has_distribution[i] = copyFinite(batch->probabilities[i], static_cast<int>(classes),
+                                     rows_.data() + labelled * classes);
+    labelled += has_distribution[i] ? 1 : 0;
+    counts->invalid += has_distribution[i] ? 0 : 1;
   }
-  evidence_.compute(rows_.data(), labelled, row_evidence_.data());
+  quantise_(rows_.data(), labelled * classes, EvidenceConstants{0.0f, kProbabilityUnit, 0}, nullptr,
+            row_evidence_.data());
   const std::int32_t* next = row_evidence_.data();
   for (int i = 0; i < batch->count; ++i) {
     if (!placed.inside[i]) {
       ++counts->out_of_range;
       continue;
     }
-    VoxelHeader* const voxel = header(records[i]);
+    VoxelHeader* const voxel = header(record(found[i]));
     voxel->observations = saturatingSum(voxel->observations, 1);
     voxel->sum_x += placed.offset[0][i];
     voxel->sum_y += placed.offset[1][i];
     voxel->sum_z += placed.offset[2][i];
     voxel->sum_intensity += batch->intensity[i];
-    voxel->first_ns = std::min<std::int64_t>(voxel->first_ns, stamp);
-    voxel->last_ns = std::max<std::int64_t>(voxel->last_ns, stamp);
-    if (!has_evidence[i]) {
+    std::size_t index = 0;
+    const std::size_t looks = looks_.size();
+    Look& look = lookAt(found[i], &index);
+    // Rays to one voxel cross the same ones.
+    if (index == looks && config_.ray_range_m > 0.0) addRay(pose, *batch, i);
+    if (!has_distribution[i]) {
       ++counts->occupied;
       continue;
     }
     ++counts->labelled;
-    voxel->labelled = saturatingSum(voxel->labelled, 1);
-    add_evidence_(next, classes, records[i] + kHeaderWords);
+    ++look.labelled;
+    add_evidence_(next, static_cast<int>(classes), look_sums_.data() + index * classes);
     next += classes;
   }
   batch->count = 0;
 }
 
-void VoxelMap::add(const std::uint8_t* records, std::size_t bytes) {
-  if (bytes % recordSize() != 0)
-    throw DataError("voxel map: " + std::to_string(bytes) +
-                    " bytes are no whole number of records of " + std::to_string(recordSize()) +
-                    " bytes");
-  for (const std::uint8_t* at = records; at != records + bytes; at += recordSize()) {
-    VoxelHeader other;
-    std::memcpy(&other, at, sizeof other);
-    const std::uint64_t xy = packXy(other.x, other.y);
-    const std::uint32_t z_layer = packZ(other.z, other.layer & 1U);
-    std::int64_t* const ours = findOrMake(xy, z_layer, hashOf(xy, z_layer));
-    VoxelHeader* const voxel = header(ours);
-    voxel->observations = saturatingSum(voxel->observations, other.observations);
-    voxel->labelled = saturatingSum(voxel->labelled, other.labelled);
-    voxel->sum_x += other.sum_x;
-    voxel->sum_y += other.sum_y;
-    voxel->sum_z += other.sum_z;
-    voxel->sum_intensity += other.sum_intensity;
-    voxel->first_ns = std::min(voxel->first_ns, other.first_ns);
-    voxel->last_ns = std::max(voxel->last_ns, other.last_ns);
-    for (std::size_t word = kHeaderWords; word < words_; ++word) {
-      std::int64_t value;
-      std::memcpy(&value, at + word * sizeof value, sizeof value);
-      ours[word] += value;
+void VoxelMap::addRay(const PlacementConstants& pose, const Batch& batch, int i) {
+  const double x = batch.placed.x[i], y = batch.placed.y[i], z = batch.placed.z[i];
+  Ray ray;
+  for (int axis = 0; axis < 3; ++axis) {
+    const double* const row = pose.rows[axis];
+    ray.end[axis] = (row[0] * x + row[1] * y + row[2] * z + row[3]) / config_.voxel_size_m;
+    const double from = batch.origins[i] ? batch.origins[i][axis] : row[3];
+    ray.origin[axis] = from / config_.voxel_size_m;
+    if (!(std::abs(ray.origin[axis]) < kMaxVoxel)) return;
+  }
+  rays_.push_back(ray);
+}
+
+/// The look's mean distribution over the classes that returns can be of; 0 if it says nothing.
+int VoxelMap::meanOfLook(std::size_t look, float* mean) const {
+  const std::size_t classes = config_.returns.size();
+  const std::int64_t* const sums = look_sums_.data() + look * classes;
+  std::int64_t all = 0, kept = 0;
+  for (std::size_t c = 0; c < classes; ++c) {
+    all += sums[c];
+    kept += config_.returns[c] != 0 ? sums[c] : 0;
+  }
+  if (static_cast<double>(kept) <= kLeastShare * static_cast<double>(all)) return 0;
+  for (std::size_t c = 0; c < classes; ++c) {
+    mean[c] = config_.returns[c] != 0
+                  ? static_cast<float>(static_cast<double>(sums[c]) / static_cast<double>(kept))
+                  : 0.0f;
+  }
+  return 1;
+}
+
+void VoxelMap::finishLooks(StampNs stamp) {
+  const std::size_t classes = config_.returns.size();
+  for (std::size_t begin = 0; begin < looks_.size(); begin += EvidenceModel::kMaxRows) {
+    const std::size_t end = std::min<std::size_t>(begin + EvidenceModel::kMaxRows, looks_.size());
+    int rows = 0;
+    std::int64_t* records[EvidenceModel::kMaxRows];
+    for (std::size_t i = begin; i < end; ++i) {
+      std::int64_t* const at = record(looks_[i].record);
+      VoxelHeader* const voxel = header(at);
+      voxel->looks = saturatingSum(voxel->looks, 1);
+      voxel->first_ns = std::min<std::int64_t>(voxel->first_ns, stamp);
+      voxel->last_ns = std::max<std::int64_t>(voxel->last_ns, stamp);
+      voxel->passes_after = 0;
+      if (looks_[i].labelled == 0) continue;
+      records[rows] = at;
+      rows += meanOfLook(i, rows_.data() + static_cast<std::size_t>(rows) * classes);
     }
+    evidence_.compute(rows_.data(), rows, row_evidence_.data());
+    for (int row = 0; row < rows; ++row) {
+      std::int32_t* const evidence = row_evidence_.data() + static_cast<std::size_t>(row) * classes;
+      for (std::size_t c = 0; c < classes; ++c) evidence[c] = config_.returns[c] ? evidence[c] : 0;
+      VoxelHeader* const voxel = header(records[row]);
+      voxel->labelled = saturatingSum(voxel->labelled, 1);
+      add_evidence_(evidence, static_cast<int>(classes), records[row] + kHeaderWords);
+    }
+  }
+}
+
+void VoxelMap::castRays() {
+  if (rays_.empty()) return;
+  const double reach = config_.ray_range_m / config_.voxel_size_m;
+  for (const Ray& ray : rays_) free_.cast(ray, reach);
+  for (const Look& look : looks_) {
+    const VoxelHeader& voxel = *header(record(look.record));
+    free_.spare({voxel.x, voxel.y, voxel.z});
+  }
+  std::vector<VoxelKey> passed;
+  free_.finishScan(&passed);
+  for (const VoxelKey& key : passed) addPasses(1, find(key));
+}
+
+void VoxelMap::addPasses(std::uint32_t count, std::int64_t* record) {
+  VoxelHeader* const voxel = header(record);
+  voxel->passes = std::min(voxel->passes + count, kMaxPasses);
+  voxel->passes_after = std::min(voxel->passes_after + count, kMaxPasses);
+}
+
+void VoxelMap::add(const std::uint8_t* records, std::size_t bytes, const std::uint8_t* bricks,
+                   std::size_t brick_bytes) {
+  const auto check_whole = [](std::size_t size, std::size_t unit, const char* what) {
+    if (size % unit != 0)
+      throw DataError("voxel map: " + std::to_string(size) + " bytes are no whole number of " +
+                      what + " of " + std::to_string(unit) + " bytes");
+  };
+  check_whole(bytes, recordSize(), "records");
+  check_whole(brick_bytes, sizeof(FreeBrick), "bricks");
+  for (const std::uint8_t* at = records; at != records + bytes; at += recordSize()) addRecord(at);
+  if (!(config_.ray_range_m > 0.0)) return;
+  std::vector<VoxelKey> passed;
+  std::vector<std::uint32_t> counts;
+  for (const std::uint8_t* at = bricks; at != bricks + brick_bytes; at += sizeof(FreeBrick)) {
+    FreeBrick brick;
+    std::memcpy(&brick, at, sizeof brick);
+    free_.add(brick, &passed, &counts);
+  }
+  for (std::size_t i = 0; i < passed.size(); ++i) addPasses(counts[i], find(passed[i]));
+}
+
+void VoxelMap::addRecord(const std::uint8_t* at) {
+  VoxelHeader other;
+  std::memcpy(&other, at, sizeof other);
+  const std::uint64_t xy = packXy(other.x, other.y);
+  const auto z = static_cast<std::uint32_t>(other.z);
+  std::int64_t* const ours = record(findOrMake(xy, z, hashOf(xy, z)));
+  VoxelHeader* const voxel = header(ours);
+  voxel->observations = saturatingSum(voxel->observations, other.observations);
+  voxel->looks = saturatingSum(voxel->looks, other.looks);
+  voxel->labelled = saturatingSum(voxel->labelled, other.labelled);
+  voxel->passes = std::min(voxel->passes + std::min(other.passes, kMaxPasses), kMaxPasses);
+  voxel->passes_after = std::min(other.passes_after, kMaxPasses);
+  voxel->sum_x += other.sum_x;
+  voxel->sum_y += other.sum_y;
+  voxel->sum_z += other.sum_z;
+  voxel->sum_intensity += other.sum_intensity;
+  voxel->first_ns = std::min(voxel->first_ns, other.first_ns);
+  voxel->last_ns = std::max(voxel->last_ns, other.last_ns);
+  for (std::size_t word = kHeaderWords; word < words_; ++word) {
+    std::int64_t value;
+    std::memcpy(&value, at + word * sizeof value, sizeof value);
+    ours[word] += value;
   }
 }
 
@@ -360,8 +484,14 @@ std::vector<std::uint8_t> VoxelMap::records(bool sorted) const {
   return result;
 }
 
-void VoxelMap::keepInside(const std::array<std::int32_t, 3>& min,
-                          const std::array<std::int32_t, 3>& max) {
+std::vector<std::uint8_t> VoxelMap::bricks(bool sorted) const {
+  const std::vector<FreeBrick> bricks = free_.bricks(sorted);
+  std::vector<std::uint8_t> result(bricks.size() * sizeof(FreeBrick));
+  if (!bricks.empty()) std::memcpy(result.data(), bricks.data(), result.size());
+  return result;
+}
+
+void VoxelMap::keepInside(const VoxelKey& min, const VoxelKey& max) {
   const auto inside = [&](const VoxelHeader& v) {
     return v.x >= min[0] && v.x <= max[0] && v.y >= min[1] && v.y <= max[1] && v.z >= min[2] &&
            v.z <= max[2];
@@ -385,8 +515,18 @@ void VoxelMap::keepInside(const std::array<std::int32_t, 3>& min,
   slots_.shrink_to_fit();
   for (std::size_t i = 0; i < size_; ++i) {
     const VoxelHeader& voxel = *header(record(i));
-    place(Slot{packXy(voxel.x, voxel.y), packZ(voxel.z, voxel.layer),
+    place(Slot{packXy(voxel.x, voxel.y), static_cast<std::uint32_t>(voxel.z),
                static_cast<std::uint32_t>(i + 1)});
+  }
+  look_of_record_.resize(std::min(look_of_record_.size(), chunks_.size() * kChunkSize));
+  look_of_record_.shrink_to_fit();
+  looks_.clear();
+  if (!(config_.ray_range_m > 0.0)) return;
+  free_.keepInside(min, max);
+  // They hold no pass: claiming gives back 0.
+  for (std::size_t i = 0; i < size_; ++i) {
+    const VoxelHeader& voxel = *header(record(i));
+    free_.claim({voxel.x, voxel.y, voxel.z});
   }
 }
 

@@ -93,7 +93,6 @@ SemanticPoints view(const Scan& scan) {
   points.z = column(&p.z);
   points.intensity = column(&p.intensity);
   points.status = column(&p.status);
-  points.label = column(&p.label);
   points.probabilities = column(p.probabilities);
   return points;
 }

@@ -105,9 +105,11 @@ def test_rviz_shows_topics_that_the_chain_publishes():
     launch = ET.parse(os.path.join(SOURCE_DIR, "launch", "rviz.launch"))
     remaps = {r.get("from"): r.get("to") for r in launch.iter("remap")}
     assert shown == set(remaps)
-    nodelets = "".join(text_of(path) for path in files("nodelets/*_nodelet.cpp"))
+    publishers = files("nodelets/*_nodelet.cpp")
+    publishers.append(os.path.join(SOURCE_DIR, "scripts/semantic_lidar_fusion/maps/server.py"))
+    code = "".join(text_of(path) for path in publishers)
     for name in remaps.values():
-        assert '"%s"' % name.split("/")[-1] in nodelets, name
+        assert '"%s"' % name.split("/")[-1] in code, name
     channels = {d["Channel Name"] for d in displays if "Channel Name" in d}
     assert channels == {"p_road"}
     for name in ("usyd12", "cityscapes", "camvid12"):

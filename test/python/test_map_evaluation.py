@@ -43,13 +43,20 @@ def test_the_least_nll_is_at_the_weight_that_is_right():
     p[np.arange(count), seen], p[np.arange(count), 1 - seen] = confidence, 1 - confidence
     xyz = np.zeros((count, 3), dtype=np.float32)
     xyz[:, 0] = np.arange(count) + 0.5
-    voxels = VoxelMap(MapConfig(voxel_size_m=1.0, weight=1.0, clamp=50.0), LABELS)
+    voxels = VoxelMap(
+        MapConfig(
+            voxel_size_m=1.0, weight=1.0, floor=1e-3, clamp=50.0, max_range_m=0, ray_range_m=0
+        ),
+        LABELS,
+    )
     for _ in range(repeats):
         zeros = np.zeros(count)
-        voxels.integrate_columns(list(xyz.T), zeros, zeros, seen, p, np.eye(4), 0)
+        voxels.integrate_columns(list(xyz.T), zeros, zeros, p, np.eye(4), 0)
     indices = np.zeros((count, 3), dtype=np.int64)
     indices[:, 0] = np.arange(count)
     scores = compare_weights(
-        voxels, LABELS, TrueVoxels(VoxelIndex(indices), truth.astype(np.uint8))
+        voxels,
+        LABELS,
+        TrueVoxels(VoxelIndex(indices), truth.astype(np.uint8), truth.astype(np.uint8), indices),
     )
     assert min(scores, key=lambda score: score.nll).weight == 0.25

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: MIT
 /// Class ids, names and colours as one table, loaded from a class-set YAML file.
 ///
-/// File format (see config/classes_*.yaml): `classes:` a list of {name, color: [r, g, b], dynamic}
-/// whose position is the class id (an explicit `id` must equal it); `evaluation:` {discard:
+/// File format (see config/classes_*.yaml): `classes:` a list of {name, color: [r, g, b], dynamic,
+/// lidar} whose position is the class id (an explicit `id` must equal it); `evaluation:` {discard:
 /// [names], merge: {merged_name: [names]}}. Names match [a-z0-9_]+, since `p_<name>` is a cloud
 /// field.
 #pragma once
@@ -23,6 +23,8 @@ struct ClassInfo {
   std::string name;
   std::array<std::uint8_t, 3> color_rgb{};
   bool dynamic = false;  ///< moves by itself (vehicles, people): maps keep it apart
+  /// Whether a lidar's return can be of it; maps leave the others out. Not given: by its name.
+  std::optional<bool> lidar;
 };
 
 /// Merged class of the evaluation: the union of `members` (class ids).
@@ -52,8 +54,8 @@ class LabelSet {
   const std::vector<int>& discarded() const { return discarded_; }
   /// Merge map for evaluation; a class that is neither merged nor discarded stands alone.
   const std::vector<MergedClass>& merged() const { return merged_; }
-  /// The `class_info` message: {"classes": [{"id", "name", "color": [r, g, b], "dynamic"}],
-  /// "discard": [names], "merge": {name: [names]}}.
+  /// The `class_info` message: {"classes": [{"id", "name", "color": [r, g, b], "dynamic"
+  /// and, if it was given, "lidar"}], "discard": [names], "merge": {name: [names]}}.
   std::string toJson() const;
 
  private:

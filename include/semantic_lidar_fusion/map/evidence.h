@@ -23,8 +23,8 @@ enum class EvidenceKind { kLog, kDirichlet };
 
 struct EvidenceConfig {
   EvidenceKind kind = EvidenceKind::kLog;
-  double weight = 0.7;        ///< w, (0, 1]: below 1 because frames of one network are alike
-  double floor = 1e-3;        ///< eps, [1e-6, 1): the least probability that is believed
+  double weight = 1.0;        ///< w, (0, 1]
+  double floor = 1e-2;        ///< eps, [1e-6, 1): the least probability that is believed
   std::vector<double> prior;  ///< one per class, each in [1e-6, 1], sum 1
 };
 

@@ -326,13 +326,8 @@ def _add_maps(
     labels: LabelSet,
 ) -> None:
     from semantic_lidar_fusion.evaluation import map_scoring
+    from semantic_lidar_fusion.maps.drive import Drive, choose_frame, first_cloud, poses_of
     from semantic_lidar_fusion.maps.semantic_map import MapConfig
-    from semantic_lidar_fusion.maps.build import (
-        Drive,
-        choose_frame,
-        first_cloud,
-        transforms_of,
-    )
 
     fused = [FusedBag(column.path, labels.names) for column in columns if column.name != "live"]
     drive = Drive(fused[-1].path, tuple(options.bags))
@@ -340,7 +335,7 @@ def _add_maps(
     config = MapConfig(voxel_size_m=options.voxel).checked(len(labels))
     names = [column.name for column in columns if column.name != "live"]
     compared = map_scoring.evaluate_maps(
-        names, fused, truth, labels, transforms_of(drive), frame_id, config
+        names, fused, truth, labels, poses_of(drive), frame_id, config
     )
     section, files = map_scoring.tables(compared)
     results.sections.append(section)

@@ -1,40 +1,37 @@
 # SPDX-License-Identifier: MIT
 """From bags with semantic clouds to one map file, in one process or many.
 
-The drives are cut into parts of a few scans. Every part becomes records, wherever it is computed;
-records are added up here and spilled to disk when they outgrow the memory that they may take. Sums
-of whole numbers know no order, so that one process, many workers and a cluster give the same bytes.
+The drives are cut into parts of a few scans. Every part becomes records and bricks, wherever it is
+computed; they are added up here in the order of time, and spilled to disk when they outgrow the memory
+that they may take. One process, many workers and a cluster give the same bytes.
 """
 
+import collections
 import dataclasses
-import json
 import os
+import time
 from concurrent import futures
-from typing import Any, Callable, Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Deque, Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.bags.bag_io import BagReader
-from semantic_lidar_fusion.bags.cloud_io import SemanticCloud
 from semantic_lidar_fusion.errors import DataError
-from semantic_lidar_fusion.labels import LabelSet
-from semantic_lidar_fusion.bags.poses import TransformTree
-from semantic_lidar_fusion.maps.semantic_map import COUNTS, VoxelMap, record_dtype
-from semantic_lidar_fusion.maps.map_file import MapHeader, MapReader, MapWriter, merge_files
+from semantic_lidar_fusion.maps.drive import Drive, clouds_of
+from semantic_lidar_fusion.maps.map_file import (
+    MapHeader,
+    MapReader,
+    MapWriter,
+    joined_path,
+    merge_files,
+)
+from semantic_lidar_fusion.maps.records import BRICK, PATH, record_dtype
+from semantic_lidar_fusion.maps.semantic_map import COUNTS, VoxelMap
 
-CLOUD_TOPIC = "/points_semantic"
-FRAMES = ("map", "odom")  # of the map, the first that tf connects to the clouds
 SCANS_PER_PART = 20
-
-
-class Drive(NamedTuple):
-    """A bag with semantic clouds, and the bags that hold its tf (itself, if they are none)."""
-
-    clouds: str
-    tf: Tuple[str, ...]
-    topic: str = CLOUD_TOPIC
-    odometry: str = ""  # topic of nav_msgs/Odometry to take beside tf
+# What does not answer for so long is lost (s).
+DASK_PATIENCE_S = 8.0
 
 
 class Part(NamedTuple):
@@ -43,95 +40,6 @@ class Part(NamedTuple):
     drive: Drive
     begin_ns: int
     end_ns: int
-
-
-_trees: Dict[Tuple[Tuple[str, ...], str], TransformTree] = {}
-
-
-def transforms_of(drive: Drive) -> TransformTree:
-    """The tf of a drive; the last one read is kept."""
-    paths = drive.tf or (drive.clouds,)
-    key = (paths, drive.odometry)
-    if key in _trees:
-        return _trees[key]
-    tree = TransformTree()
-    for path in paths:
-        with BagReader(path) as bag:
-            for topic in ("/tf_static", "/tf"):
-                for item in bag.read([topic]):
-                    for transform in item.message.transforms:
-                        tree.add(transform, topic == "/tf_static")
-            if drive.odometry:
-                bag.require_topic(drive.odometry, "nav_msgs/Odometry")
-                for item in bag.read([drive.odometry]):
-                    tree.add(_as_transform(item.message), False)
-    _trees.clear()
-    _trees[key] = tree
-    return tree
-
-
-def _as_transform(odometry: Any) -> Any:
-    from geometry_msgs.msg import TransformStamped
-
-    result = TransformStamped()
-    result.header = odometry.header
-    result.child_frame_id = odometry.child_frame_id
-    pose = odometry.pose.pose
-    result.transform.translation.x = pose.position.x
-    result.transform.translation.y = pose.position.y
-    result.transform.translation.z = pose.position.z
-    result.transform.rotation = pose.orientation
-    return result
-
-
-def first_cloud(drive: Drive) -> SemanticCloud:
-    with BagReader(drive.clouds) as bag:
-        bag.require_topic(drive.topic, "sensor_msgs/PointCloud2")
-        for item in bag.read([drive.topic]):
-            return SemanticCloud.from_message(item.message)
-    raise DataError("%s: %s is empty" % (drive.clouds, drive.topic))
-
-
-def class_set(drive: Drive, cloud: SemanticCloud, classes_file: Optional[str]) -> LabelSet:
-    """From the file, else the bag's class_info; its names must be the cloud's."""
-    if classes_file:
-        labels = LabelSet.from_file(classes_file)
-    else:
-        with BagReader(drive.clouds) as bag:
-            if "/class_info" not in bag.topics:
-                raise DataError(
-                    "%s: no topic /class_info; name the class set with --classes" % drive.clouds
-                )
-            (message,) = [item.message for item in bag.read(["/class_info"])][:1]
-        try:
-            labels = LabelSet.from_class_info(json.loads(message.data))
-        except ValueError as error:
-            raise DataError("%s: class_info is not JSON (%s)" % (drive.clouds, error)) from error
-    if labels.names != cloud.class_names:
-        raise DataError(
-            "%s: its clouds have the classes %s; the class set has %s"
-            % (drive.clouds, ", ".join(cloud.class_names), ", ".join(labels.names))
-        )
-    return labels
-
-
-def choose_frame(drive: Drive, cloud: SemanticCloud, wanted: Optional[str]) -> str:
-    """The map's frame: as wanted, else the first of FRAMES that tf connects to the clouds."""
-    tree = transforms_of(drive)
-    stamps = np.array([cloud.stamp_ns])
-    if wanted:
-        tree.lookup(wanted, cloud.frame_id, stamps)
-        return wanted.lstrip("/")
-    for frame in FRAMES:
-        try:
-            tree.lookup(frame, cloud.frame_id, stamps)
-            return frame
-        except DataError:
-            continue
-    raise DataError(
-        "%s: tf connects %s to neither %s; name the map's frame with --frame, and the bag that has "
-        "the tf with --tf" % (drive.clouds, cloud.frame_id, " nor ".join(FRAMES))
-    )
 
 
 def parts_of(drive: Drive, scans: int = SCANS_PER_PART) -> List[Part]:
@@ -144,23 +52,20 @@ def parts_of(drive: Drive, scans: int = SCANS_PER_PART) -> List[Part]:
 
 
 class PartResult(NamedTuple):
-    """Records (bytes of `record_dtype`) of a part; clouds, of which without_pose were dropped, and
-    what became of the points of the others (COUNTS)."""
+    """Records, bricks and path (bytes of their types) of a part; clouds, of which without_pose were
+    dropped, and what became of the points of the others (COUNTS)."""
 
     records: bytes
+    bricks: bytes
+    path: bytes
     clouds: int
     without_pose: int
     points: Dict[str, int]
 
 
-def clouds_of(part: Part, frame_id: str) -> Iterator[Tuple[SemanticCloud, Optional[np.ndarray]]]:
-    """Clouds of a part with T_map_lidar at their stamps, None where tf does not cover them."""
-    tree = transforms_of(part.drive)
-    with BagReader(part.drive.clouds) as bag:
-        for item in bag.read([part.drive.topic], start_ns=part.begin_ns, end_ns=part.end_ns):
-            cloud = SemanticCloud.from_message(item.message)
-            poses, covered = tree.lookup(frame_id, cloud.frame_id, np.array([cloud.stamp_ns]))
-            yield cloud, poses[0] if covered[0] else None
+def pose_of_path(stamp_ns: int, position: np.ndarray) -> np.ndarray:
+    """(1,) of PATH."""
+    return np.array([(stamp_ns, *(float(v) for v in position))], dtype=PATH)
 
 
 def compute_part(part: Part, header_bytes: bytes, native: Optional[bool] = None) -> PartResult:
@@ -168,44 +73,59 @@ def compute_part(part: Part, header_bytes: bytes, native: Optional[bool] = None)
     header = MapHeader.decoded(header_bytes, "header")
     voxels = VoxelMap(header.config, header.labels, native)
     clouds = without_pose = 0
+    path: List[np.ndarray] = []
     points = dict.fromkeys(COUNTS, 0)
-    for cloud, pose in clouds_of(part, header.frame_id):
+    for seen in clouds_of(part.drive, header.frame_id, part.begin_ns, part.end_ns):
         clouds += 1
-        if pose is None:
+        if seen is None:
             without_pose += 1
             continue
-        for name, count in voxels.integrate(cloud, pose).items():
+        path.append(pose_of_path(seen.cloud.stamp_ns, seen.vehicle))
+        for name, count in voxels.integrate(seen.cloud, seen.pose, seen.origins).items():
             points[name] += count
-    return PartResult(voxels.records().tobytes(), clouds, without_pose, points)
+    return PartResult(
+        voxels.records().tobytes(),
+        voxels.bricks().tobytes(),
+        joined_path(path).tobytes(),
+        clouds,
+        without_pose,
+        points,
+    )
 
 
 class Accumulator:
-    """Adds records up and spills them to files in `folder` beyond `memory_bytes`."""
+    """Adds up what comes in the order of time, and spills it to files in `folder` beyond
+    `memory_bytes`."""
 
     def __init__(self, header: MapHeader, folder: str, memory_bytes: int):
         self.header, self.folder, self.memory_bytes = header, folder, memory_bytes
         self.voxels = VoxelMap(header.config, header.labels)
+        self._path: List[np.ndarray] = []
         self._runs: List[str] = []
 
-    def add(self, records: np.ndarray) -> None:
-        self.voxels.add(records)
+    def add(self, records: np.ndarray, bricks: np.ndarray, path: np.ndarray) -> None:
+        self.voxels.add(records, bricks)
+        self._path.append(path)
         if self.voxels.memory_bytes > self.memory_bytes:
             self.spill()
 
     def spill(self) -> None:
-        path = os.path.join(self.folder, "run%05d.voxels" % len(self._runs))
-        with MapWriter(path, self.header) as writer:
-            writer.write(self.voxels.records())
-        self._runs.append(path)
+        target = os.path.join(self.folder, "run%05d.voxels" % len(self._runs))
+        with MapWriter(target, self.header) as writer:
+            writer.write(self.voxels.records(), self.voxels.bricks())
+            writer.add_path(joined_path(self._path))
+        self._runs.append(target)
         self.voxels.clear()
+        self._path = []
 
     def write(self, target: str, others: Iterable[str] = ()) -> None:
         """Writes the sum of everything, and of the map files `others`, as one map file."""
-        if len(self.voxels):
+        if self._path:
             self.spill()
-        merge_files(self._runs + list(others), target, self.header)
-        for path in self._runs:
-            os.remove(path)
+        sources = self._runs + list(others)
+        merge_files(sorted(sources, key=lambda p: MapReader(p).begin_ns), target, self.header)
+        for run in self._runs:
+            os.remove(run)
         self._runs = []
 
 
@@ -232,42 +152,50 @@ class Totals:
 def map_drives(
     drives: List[Drive], header: MapHeader, work: Work, accumulator: Accumulator
 ) -> Totals:
-    """Adds all clouds of the drives to the accumulator."""
-    parts = [part for drive in drives for part in parts_of(drive)]
+    """Adds all clouds of the drives to the accumulator, the earliest drive first."""
+    by_drive = sorted(
+        (parts_of(drive) for drive in drives), key=lambda p: p[0].begin_ns if p else 0
+    )
+    parts = [part for of_drive in by_drive for part in of_drive]
     encoded = header.encoded()
     totals = Totals()
     dtype = record_dtype(len(header.labels))
     for result in cli.progress(_results(parts, encoded, work), len(parts), "map"):
         totals.add(result)
-        accumulator.add(np.frombuffer(result.records, dtype=dtype))
+        accumulator.add(
+            np.frombuffer(result.records, dtype=dtype),
+            np.frombuffer(result.bricks, dtype=BRICK),
+            np.frombuffer(result.path, dtype=PATH),
+        )
     if totals.clouds and totals.clouds == totals.without_pose:
         raise DataError(
-            "tf covers none of the %d clouds; fused bags hold no tf: name the bags that do with --tf"
-            % totals.clouds
+            "no pose covers any of the %d clouds; fused bags hold no tf: name the bags that do with "
+            "--tf, or give --poses" % totals.clouds
         )
     return totals
 
 
 def _results(parts: List[Part], header: bytes, work: Work) -> Iterator[PartResult]:
-    if work.scheduler:
+    if work.scheduler is not None:
         return _dask_results(parts, header, work.scheduler)
     if work.workers > 1:
         return _process_results(parts, header, work.workers)
     return (compute_part(part, header) for part in parts)
 
 
-def _in_flight(
-    parts: List[Part], limit: int, submit: Callable[[Part], Any], wait: Callable[[Any], Any]
+def _in_order(
+    parts: List[Part], limit: int, submit: Callable[[Part], Any], wait: Callable[[Any], PartResult]
 ) -> Iterator[PartResult]:
-    """Results in any order, with at most `limit` parts on their way: finished ones hold memory."""
-    remaining, flying = list(reversed(parts)), set()  # type: Any
+    """Results in the order of the parts, with at most `limit` on their way: finished ones hold
+    memory."""
+    remaining: Deque[Part] = collections.deque(parts)
+    flying: Deque[Any] = collections.deque()
     try:
         while remaining or flying:
             while remaining and len(flying) < limit:
-                flying.add(submit(remaining.pop()))
-            done, flying = wait(flying)
-            for future in done:
-                yield future.result()
+                flying.append(submit(remaining.popleft()))
+            yield wait(flying[0])
+            flying.popleft()
     finally:
         for future in flying:
             future.cancel()
@@ -275,13 +203,12 @@ def _in_flight(
 
 def _process_results(parts: List[Part], header: bytes, workers: int) -> Iterator[PartResult]:
     with futures.ProcessPoolExecutor(max_workers=workers) as pool:
-
-        def wait(flying: Any) -> Any:
-            return futures.wait(flying, return_when=futures.FIRST_COMPLETED)
-
         try:
-            yield from _in_flight(
-                parts, workers + 2, lambda part: pool.submit(compute_part, part, header), wait
+            yield from _in_order(
+                parts,
+                2 * workers,
+                lambda part: pool.submit(compute_part, part, header),
+                lambda future: future.result(),
             )
         except futures.process.BrokenProcessPool as error:
             raise DataError("a worker process died (out of memory?)") from error
@@ -289,30 +216,68 @@ def _process_results(parts: List[Part], header: bytes, workers: int) -> Iterator
 
 def _dask_results(parts: List[Part], header: bytes, scheduler: str) -> Iterator[PartResult]:
     cli.require("distributed")
+    import logging
+
     import distributed
 
+    # Its own complaints, a page each, come before the line that says what it means.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+    logging.getLogger("tornado").setLevel(logging.CRITICAL + 1)
     try:
-        client = distributed.Client(scheduler, timeout=20)
-    except (OSError, ValueError, TimeoutError) as error:
+        client = distributed.Client(scheduler, timeout=DASK_PATIENCE_S)
+    except Exception as error:  # whatever an address may be wrong in
         raise DataError("no Dask scheduler at %s (%s)" % (scheduler, error)) from error
     try:
-        workers = max(1, len(client.scheduler_info()["workers"]))
+        workers = _dask_workers(client)
+        if not workers:
+            try:
+                client.wait_for_workers(1, timeout=DASK_PATIENCE_S)
+            except Exception as error:
+                raise DataError("the Dask scheduler at %s has no workers" % scheduler) from error
+        yield from _in_order(
+            parts,
+            2 * max(1, workers),
+            lambda part: client.submit(compute_part, part, header, pure=False),
+            lambda future: _dask_wait(client, future, scheduler),
+        )
+    finally:
+        try:
+            client.close(timeout=1)
+        except Exception:
+            pass  # a scheduler that is gone cannot be told
 
-        def wait(flying: Any) -> Any:
-            return distributed.wait(list(flying), return_when="FIRST_COMPLETED")
 
-        def submit(part: Part) -> Any:
-            return client.submit(compute_part, part, header, pure=False)
+def _dask_workers(client: Any) -> int:
+    return len(client.scheduler_info().get("workers", {}))
 
-        for result in _in_flight(parts, 2 * workers, submit, wait):
-            yield result
+
+def _dask_wait(client: Any, future: Any, scheduler: str) -> PartResult:
+    """The result of a future; DataError if its cluster is lost."""
+    from distributed.comm import CommClosedError
+    from distributed.scheduler import KilledWorker
+
+    good_at = time.monotonic()
+    while not future.done():
+        time.sleep(0.02)
+        alive = client.status == "running"
+        if alive and _dask_workers(client):
+            good_at = time.monotonic()
+        elif time.monotonic() - good_at > DASK_PATIENCE_S:
+            what = (
+                "all workers of the Dask scheduler at %s" if alive else "the Dask scheduler at %s"
+            )
+            raise DataError((what + " are gone" if alive else what + " is gone") % scheduler)
+    try:
+        return future.result(timeout=DASK_PATIENCE_S)  # type: ignore[no-any-return]
     except ImportError as error:
         raise DataError(
             "a Dask worker cannot import the package (%s); start the workers with its setup.bash "
             "sourced" % error
         ) from error
-    finally:
-        client.close()
+    except KilledWorker as error:
+        raise DataError("Dask workers died again and again (out of memory?)") from error
+    except (futures.CancelledError, CommClosedError, TimeoutError, OSError) as error:
+        raise DataError("the Dask scheduler at %s is gone (%s)" % (scheduler, type(error).__name__)) from error  # fmt: skip
 
 
 def check_inputs(paths: List[str]) -> Tuple[List[str], List[str]]:

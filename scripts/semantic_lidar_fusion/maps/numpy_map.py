@@ -5,21 +5,28 @@ It serves where that module is not built, and as its reference in tests. Every o
 point is one that IEEE 754 defines, in the order of the C++ source."""
 
 import math
-from typing import List, Sequence
+from typing import List, Sequence, Tuple
 
 import numpy as np
 
-from semantic_lidar_fusion.maps.semantic_map import (
+from semantic_lidar_fusion.maps.records import (
+    BRICK,
     EVIDENCE_BITS,
+    MAX_PASSES,
     UNIT,
+    bricks_of,
     canonical_order,
+    free_voxels,
     record_dtype,
+    voxel_indices,
 )
 
 _GUARD_BITS = 6  # of the logarithm, below the bits of the result
 _ROOT_HALF = np.int32(0x3F3504F3)  # the bits of sqrt(1/2)
 _MAX_INDEX = float(1 << 29)
 _MAX_INTENSITY = np.float32(1e6)
+_LEAST_SHARE = 1e-3  # of a look's probability, on classes that returns can be of
+_LEAST_CHORD = 0.8  # of a ray through a voxel, in edges of it
 # ln(1 + f) = f - f^2/2 + f^3 (k0 + f (k1 + ...)) (Cephes, logf)
 _LOG = np.array(
     [
@@ -37,25 +44,131 @@ _LOG = np.array(
 )
 
 
-def merged(records: np.ndarray) -> np.ndarray:
-    """Records (M,) in canonical order, those of the same voxel added up."""
-    if not len(records):
-        return records
-    records = records[canonical_order(records)]
-    new = np.ones(len(records), dtype=bool)
-    new[1:] = False
-    for name in ("x", "y", "z", "layer"):
-        new[1:] |= records[name][1:] != records[name][:-1]
-    starts = np.flatnonzero(new)
-    result = records[starts].copy()
-    for name in ("sum_x", "sum_y", "sum_z", "sum_intensity", "evidence"):
-        result[name] = np.add.reduceat(records[name], starts, axis=0)
-    for name in ("observations", "labelled"):
-        total = np.add.reduceat(records[name].astype(np.uint64), starts)
-        result[name] = np.minimum(total, np.uint64(0xFFFFFFFF))
-    result["first_ns"] = np.minimum.reduceat(records["first_ns"], starts)
-    result["last_ns"] = np.maximum.reduceat(records["last_ns"], starts)
+class _Keys:
+    """Voxel indices as sortable numbers, relative to the least one of all that are compared."""
+
+    def __init__(self, *indices: np.ndarray):
+        every = np.concatenate(indices)
+        self._low = every.min(axis=0) if len(every) else np.zeros(3, dtype=np.int64)
+        span = every.max(axis=0) - self._low + 1 if len(every) else np.ones(3, dtype=np.int64)
+        self._span = [int(v) for v in span]
+
+    def of(self, indices: np.ndarray) -> np.ndarray:
+        x, y, z = (indices - self._low).T
+        return (x * self._span[1] + y) * self._span[2] + z
+
+
+def _find(sorted_keys: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """(M,) position of each key, -1 = none."""
+    if not len(sorted_keys):
+        return np.full(len(keys), -1)
+    at = np.minimum(np.searchsorted(sorted_keys, keys), len(sorted_keys) - 1)
+    return np.where(sorted_keys[at] == keys, at, -1)
+
+
+def merge_records(records: np.ndarray, bits: int, voxel_size_m: float) -> np.ndarray:
+    """Records (M,) of voxels 2^bits as wide, in canonical order: points and evidence added up. What
+    rays say of parts of a voxel is nothing about the whole: passes are 0."""
+    coarse = records.copy()
+    for axis in "xyz":
+        coarse[axis] = records[axis] >> bits
+        within = (records[axis] - (coarse[axis] << bits)) * (voxel_size_m * UNIT)
+        coarse["sum_" + axis] += np.rint(within).astype(np.int64) * records["observations"]
+    coarse["passes"] = coarse["passes_after"] = 0
+    keys = _Keys(voxel_indices(coarse)).of(voxel_indices(coarse))
+    result, _ = _added(coarse, keys)
+    return result[canonical_order(result)]
+
+
+def _added(records: np.ndarray, keys: np.ndarray) -> Tuple[np.ndarray, np.ndarray]:
+    """Records with the same key added up, but for their passes; and their keys, in ascending order."""
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.append(True, np.diff(keys[order]) != 0)[: len(order)])
+    result = records[order][starts].copy()
+    if len(result):
+        for name in ("sum_x", "sum_y", "sum_z", "sum_intensity", "evidence"):
+            result[name] = np.add.reduceat(records[name][order], starts, axis=0)
+        for name in ("observations", "looks", "labelled"):
+            total = np.add.reduceat(records[name][order].astype(np.uint64), starts)
+            result[name] = np.minimum(total, np.uint64(0xFFFFFFFF))
+        result["first_ns"] = np.minimum.reduceat(records["first_ns"][order], starts)
+        result["last_ns"] = np.maximum.reduceat(records["last_ns"][order], starts)
+    return result, keys[order][starts]
+
+
+class _State:
+    """Records in canonical order, and crossed voxels (N, 3) without a record with their passes."""
+
+    def __init__(self, records: np.ndarray, free: np.ndarray, passes: np.ndarray):
+        self.records, self.free, self.passes = records, free, passes
+
+    def then(self, later: "_State") -> "_State":
+        """Both, one after the other in time."""
+        mine, other = voxel_indices(self.records), voxel_indices(later.records)
+        keys = _Keys(mine, other, self.free, later.free)
+        k_mine, k_other = keys.of(mine), keys.of(other)
+        k_free, k_later = keys.of(self.free), keys.of(later.free)
+        both = np.concatenate([self.records, later.records])
+        result, k_result = _added(both, np.concatenate([k_mine, k_other]))
+        before = _passes(k_result, (k_mine, self.records["passes"]), (k_free, self.passes))
+        after = _passes(k_result, (k_other, later.records["passes"]), (k_later, later.passes))
+        result["passes"] = np.minimum(before + after, MAX_PASSES)
+        since = _passes(k_result, (k_mine, self.records["passes_after"]), (k_free, self.passes))
+        since = np.minimum(since + after, MAX_PASSES)
+        seen = np.isin(k_result, k_other)
+        latest = _passes(k_result, (k_other, later.records["passes_after"]))
+        result["passes_after"] = np.where(seen, latest, since)
+        free = np.concatenate([self.free, later.free])
+        k_all = np.concatenate([k_free, k_later])
+        kept = ~np.isin(k_all, k_result)
+        unique, first, of = np.unique(k_all[kept], return_index=True, return_inverse=True)
+        counts = np.bincount(of, np.concatenate([self.passes, later.passes])[kept], len(unique))
+        return _State(
+            result[canonical_order(result)],
+            free[kept][first],
+            np.minimum(counts, MAX_PASSES).astype(np.int64),
+        )
+
+
+def _passes(keys: np.ndarray, *sources: Tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """(N,) int64: what the sources (keys, counts) hold for each key; of one key, one source has it."""
+    result = np.zeros(len(keys), dtype=np.int64)
+    for own, counts in sources:
+        order = np.argsort(own)
+        at = _find(own[order], keys)
+        result += np.where(at >= 0, counts[order][at].astype(np.int64), 0) if len(own) else 0
     return result
+
+
+def crossed_voxels(origin: np.ndarray, end: np.ndarray, reach: float) -> np.ndarray:
+    """(M, 3) int64: voxels that rays from `origin` to `end` (N, 3; in voxels) cross within `reach`
+    of their origins, with repetitions. See src/map/free_space.cpp."""
+    way = end - origin
+    length = np.sqrt(way[:, 0] * way[:, 0] + way[:, 1] * way[:, 1] + way[:, 2] * way[:, 2])
+    cell = np.floor(origin)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        delta = np.where(way != 0.0, 1.0 / np.abs(way), np.inf)
+        first = np.where(way > 0.0, cell + 1.0 - origin, origin - cell)
+        leave = np.where(way != 0.0, first * delta, np.inf)
+        last = np.where(length > reach, reach / length, 1.0)
+        least = _LEAST_CHORD / length
+    step = np.where(way > 0.0, 1, -1)
+    at = cell.astype(np.int64)
+    entered = np.zeros(len(way))
+    result = []
+    while len(at):
+        leaves = np.minimum(leave.min(axis=1), last)
+        result.append(at[leaves - entered >= least])
+        # The first axis of the least, as the comparisons of the C++ source take it.
+        axis = np.argmin(leave, axis=1)
+        rows = np.arange(len(at))
+        goes_on = leave[rows, axis] < last
+        at, leave, delta, step = at[goes_on], leave[goes_on], delta[goes_on], step[goes_on]
+        last, least, entered = last[goes_on], least[goes_on], leaves[goes_on]
+        rows, axis = np.arange(len(at)), axis[goes_on]
+        leave[rows, axis] += delta[rows, axis]
+        at[rows, axis] += step[rows, axis]
+    return np.concatenate(result) if result else np.zeros((0, 3), dtype=np.int64)
 
 
 class NumpyVoxelMap:
@@ -70,17 +183,16 @@ class NumpyVoxelMap:
         prior: Sequence[float],
         min_range_m: float,
         max_range_m: float,
-        dynamic: Sequence[int],
-        dynamic_points: str,
+        ray_range_m: float,
+        returns: Sequence[int],
     ):
         self._size = voxel_size_m
         self._dirichlet = dirichlet
         self._floor = np.float32(floor)
         self._least = min_range_m * min_range_m
         self._most = max_range_m * max_range_m if max_range_m > 0 else np.inf
-        self._dynamic = np.zeros(256, dtype=bool)
-        self._dynamic[: len(dynamic)] = np.asarray(dynamic, dtype=bool)
-        self._dynamic_points = dynamic_points
+        self._reach = ray_range_m / voxel_size_m
+        self._returns = np.asarray(returns, dtype=bool)
         self._dtype = record_dtype(len(prior))
         fine = weight * 2.0 ** (EVIDENCE_BITS + _GUARD_BITS)
         self._scale = np.float32(weight * UNIT if dirichlet else fine)
@@ -89,37 +201,40 @@ class NumpyVoxelMap:
         self.clear()
 
     def clear(self) -> None:
-        self._merged = np.zeros(0, dtype=self._dtype)
-        self._parts: List[np.ndarray] = []
-
-    def _all(self) -> np.ndarray:
-        if self._parts:
-            self._merged = merged(np.concatenate([self._merged] + self._parts))
-            self._parts = []
-        return self._merged
+        self._state = _State(
+            np.zeros(0, self._dtype), np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
+        )
 
     def __len__(self) -> int:
-        return len(self._all())
+        return len(self._state.records)
 
     @property
     def memory_bytes(self) -> int:
-        return self._merged.nbytes + sum(part.nbytes for part in self._parts)
+        return self._state.records.nbytes + self._state.free.nbytes + self._state.passes.nbytes
 
-    def add(self, data: np.ndarray) -> None:
-        self._parts.append(merged(data.view(self._dtype)))
-        if sum(map(len, self._parts)) > max(1 << 18, len(self._merged)):
-            self._all()
+    def add(self, records: np.ndarray, bricks: np.ndarray) -> None:
+        free, passes = free_voxels(bricks.view(BRICK))
+        if not self._reach:
+            free, passes = free[:0], passes[:0]
+        self._state = self._state.then(_State(records.view(self._dtype), free, passes))
 
     def records(self, in_order: bool) -> np.ndarray:
         del in_order  # they always are
-        return self._all().view(np.uint8).reshape(-1).copy()
+        return self._state.records.view(np.uint8).reshape(-1).copy()
+
+    def bricks(self, in_order: bool) -> np.ndarray:
+        del in_order
+        bricks = bricks_of(self._state.free, self._state.passes)
+        return bricks.view(np.uint8).reshape(-1)
 
     def keep_inside(self, low: Sequence[int], high: Sequence[int]) -> None:
-        records = self._all()
-        kept = np.ones(len(records), dtype=bool)
-        for axis, least, most in zip("xyz", low, high):
-            kept &= (records[axis] >= least) & (records[axis] <= most)
-        self._merged = records[kept]
+        def inside(indices: np.ndarray) -> np.ndarray:
+            return ((indices >= low) & (indices <= high)).all(axis=1)
+
+        state = self._state
+        kept = inside(state.free)
+        records = state.records[inside(voxel_indices(state.records))]
+        self._state = _State(records, state.free[kept], state.passes[kept])
 
     def _evidence(self, probabilities: np.ndarray) -> np.ndarray:
         """(N, C) int64."""
@@ -147,60 +262,98 @@ class NumpyVoxelMap:
         z: np.ndarray,
         intensity: np.ndarray,
         status: np.ndarray,
-        label: np.ndarray,
         probabilities: np.ndarray,
         pose: np.ndarray,
         stamp_ns: int,
+        origins: np.ndarray,
     ) -> List[int]:
         known = status <= 3
         px, py, pz = (v.astype(np.float64) for v in (x, y, z))
         squared_range = px * px + py * py + pz * pz
-        finite = squared_range <= np.finfo(np.float64).max
+        finite = (squared_range > 0) & (squared_range <= np.finfo(np.float64).max)
         near = (squared_range >= self._least) & (squared_range <= self._most)
         chosen = known & finite & near
-        moving = chosen & (status == 0) & self._dynamic[label]
-        excluded = 0
-        layer = np.zeros(len(x), dtype=np.uint32)
-        if self._dynamic_points == "exclude":
-            excluded = int(moving.sum())
-            chosen &= ~moving
-        elif self._dynamic_points == "apart":
-            layer[moving] = 1
-        counts = [0, 0, int((~known).sum()), int((known & finite & ~near).sum()), excluded, 0]
-        counts[5] = int((known & ~finite).sum())
-        indices, offsets = [], []
-        inside = np.ones(len(x), dtype=bool)
-        for row in pose[:3]:
-            at = row[0] * px + row[1] * py + row[2] * pz + row[3]
+        counts = [0, 0, int((~known).sum()), int((known & finite & ~near).sum()), 0]
+        counts[4] = int((known & ~finite).sum())
+        at, inside = np.empty((len(x), 3)), np.ones(len(x), dtype=bool)
+        whole, offsets = np.empty((len(x), 3)), np.empty((len(x), 3), dtype=np.int64)
+        for axis, row in enumerate(pose[:3]):
             with np.errstate(invalid="ignore"):
-                cell = at / self._size
+                at[:, axis] = row[0] * px + row[1] * py + row[2] * pz + row[3]
+                cell = at[:, axis] / self._size
                 good = (cell < _MAX_INDEX) & (cell > -_MAX_INDEX)
             inside &= good
-            whole = np.floor(np.where(good, cell, 0.0))
-            indices.append(whole.astype(np.int32))
-            offset = np.floor((np.where(good, at, 0.0) - whole * self._size) * UNIT + 0.5)
-            offsets.append(offset.astype(np.int64))
+            whole[:, axis] = np.floor(np.where(good, cell, 0.0))
+            within = np.where(good, at[:, axis], 0.0) - whole[:, axis] * self._size
+            offsets[:, axis] = np.floor(within * UNIT + 0.5)
         counts[3] += int((chosen & ~inside).sum())
         chosen &= inside
         labelled = chosen & (status == 0)
         broken = labelled & ~np.isfinite(probabilities).all(axis=1)
-        counts[5] += int(broken.sum())
+        counts[4] += int(broken.sum())
         labelled &= ~broken
         counts[0] = int(labelled.sum())
         counts[1] = int(chosen.sum()) - counts[0]
-        points = np.zeros(counts[0] + counts[1], dtype=self._dtype)
-        for axis, index, offset in zip("xyz", indices, offsets):
-            points[axis] = index[chosen]
-            points["sum_" + axis] = offset[chosen]
+        indices = whole[chosen].astype(np.int64)
         usable = np.where(np.abs(intensity) <= _MAX_INTENSITY, intensity, np.float32(0))
-        points["sum_intensity"] = np.floor(usable[chosen].astype(np.float64) * UNIT + 0.5)
-        points["layer"] = layer[chosen]
-        points["observations"] = 1
-        points["labelled"] = labelled[chosen]
-        points["first_ns"] = points["last_ns"] = stamp_ns
-        points["evidence"][labelled[chosen]] = self._evidence(probabilities[labelled])
-        self.add(points)
+        intensities = np.floor(usable[chosen].astype(np.float64) * UNIT + 0.5).astype(np.int64)
+        looks, first = self._looks(
+            indices, offsets[chosen], intensities, labelled[chosen], probabilities[chosen], stamp_ns
+        )
+        free = np.zeros((0, 3), dtype=np.int64)
+        if self._reach and len(first):
+            begin = np.broadcast_to(pose[:3, 3], (len(x), 3)) if not len(origins) else origins
+            free = self._crossed(begin[chosen][first], at[chosen][first], voxel_indices(looks))
+        self._state = self._state.then(_State(looks, free, np.ones(len(free), dtype=np.int64)))
         return counts
+
+    def _looks(
+        self,
+        indices: np.ndarray,
+        offsets: np.ndarray,
+        intensities: np.ndarray,
+        labelled: np.ndarray,
+        probabilities: np.ndarray,
+        stamp_ns: int,
+    ) -> Tuple[np.ndarray, np.ndarray]:
+        """Records of a cloud's points in canonical order, and the first point of each."""
+        keys = _Keys(indices).of(indices)
+        _, first, of = np.unique(keys, return_index=True, return_inverse=True)
+        records = np.zeros(len(first), dtype=self._dtype)
+        for column, axis in enumerate("xyz"):
+            records[axis] = indices[first, column]
+            np.add.at(records["sum_" + axis], of, offsets[:, column])
+        np.add.at(records["sum_intensity"], of, intensities)
+        records["observations"] = np.bincount(of, minlength=len(first))
+        records["looks"] = 1
+        records["first_ns"] = records["last_ns"] = stamp_ns
+        p = np.minimum(np.maximum(probabilities[labelled], np.float32(0)), np.float32(1))
+        quantised = (p * np.float32(UNIT) + np.float32(0.5)).astype(np.int32).astype(np.int64)
+        sums = np.zeros((len(first), probabilities.shape[1]), dtype=np.int64)
+        np.add.at(sums, of[labelled], quantised)
+        total, kept = sums.sum(axis=1), sums[:, self._returns].sum(axis=1)
+        says = (kept > _LEAST_SHARE * total) & (np.bincount(of, labelled, len(first)) > 0)
+        mean = (sums[says] / kept[says, None].astype(np.float64)).astype(np.float32)
+        mean[:, ~self._returns] = 0
+        evidence = self._evidence(mean)
+        evidence[:, ~self._returns] = 0
+        records["labelled"] = says
+        records["evidence"][says] = evidence
+        order = canonical_order(records)
+        return records[order], first[order]
+
+    def _crossed(self, begin: np.ndarray, end: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """(M, 3) int64: what the rays of a cloud cross, each once, but for its own voxels and their
+        neighbours."""
+        origin = begin / self._size
+        usable = (np.abs(origin) < _MAX_INDEX).all(axis=1)
+        crossed = crossed_voxels(origin[usable], end[usable] / self._size, self._reach)
+        around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 1, 3)
+        spared = (own + around).reshape(-1, 3)
+        keys = _Keys(crossed, spared)
+        _, first = np.unique(keys.of(crossed), return_index=True)
+        crossed = crossed[first]
+        return crossed[~np.isin(keys.of(crossed), keys.of(spared))]
 
 
 def _round(value: float) -> int:

@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: MIT
 """The folder of a map: made aside and renamed, so that it is there whole or not at all."""
 
+import contextlib
+import json
 import os
 import shutil
-from typing import Any, Dict, List
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence
 
-from semantic_lidar_fusion.errors import DataError, cannot_write
-from semantic_lidar_fusion.maps.export import ABOUT_FILE, FILES, MAP_FILE, Exporter
+from semantic_lidar_fusion.errors import DataError, SemanticLidarFusionError, cannot_write
+from semantic_lidar_fusion.maps import formats
+from semantic_lidar_fusion.maps.formats import ABOUT_FILE, MAP_FILE
 from semantic_lidar_fusion.maps.map_file import MapReader
 from semantic_lidar_fusion.maps.raster import Costs
+from semantic_lidar_fusion.maps.source import MapSource
 
 
 class OutputFolder:
@@ -25,7 +29,7 @@ class OutputFolder:
             if not os.path.isdir(self.path):
                 raise DataError("%s: is a file, not a folder" % path)
             names = os.listdir(self.path)
-            strange = sorted(set(names) - set(FILES))
+            strange = sorted(set(names) - set(formats.all_files()))
             if names and not overwrite:
                 raise DataError("%s: exists already; --overwrite replaces it" % path)
             if strange:
@@ -68,17 +72,58 @@ class OutputFolder:
             raise cannot_write(self.path, error) from error
 
 
+class Exported(NamedTuple):
+    """What became of a map's exports. counts: voxels of each layer; failed: format -> reason."""
+
+    counts: Dict[str, int]
+    failed: Dict[str, str]
+
+
 def export_map(
-    folder: str, formats: List[str], costs: Costs, title: str, facts: Dict[str, Any]
-) -> Dict[str, int]:
-    """Exports MAP_FILE of a folder beside it; numbers of voxels of each layer."""
-    exporter = Exporter(MapReader(os.path.join(folder, MAP_FILE)), folder, costs)
-    exporter.write(formats, title, facts)
-    static, dynamic = exporter.extent.counts
-    return {"static": static, "dynamic": dynamic}
+    folder: str,
+    wanted: Sequence[str],
+    costs: Costs,
+    title: str,
+    facts: Dict[str, Any],
+    epsg: Optional[int] = None,
+) -> Exported:
+    """Exports MAP_FILE of a folder beside it, and writes ABOUT_FILE. A format that fails leaves the
+    others alone: its files are removed, its reason is returned."""
+    source = MapSource(MapReader(os.path.join(folder, MAP_FILE)), costs, title, epsg)
+    about: Dict[str, Any] = {}
+    failed: Dict[str, str] = {}
+    for name in wanted:
+        entry = formats.find(name)
+        try:
+            about.update(entry.load()(source, folder))
+        except (SemanticLidarFusionError, OSError, MemoryError, ImportError) as error:
+            failed[name] = str(error) or type(error).__name__
+            for file in entry.files:
+                with contextlib.suppress(OSError):
+                    os.remove(os.path.join(folder, file))
+    header = source.header
+    counts = dict(zip(("static", "dynamic", "gone"), source.extent.counts))
+    about.update(
+        frame_id=header.frame_id,
+        config=header.config.tree(),
+        classes=header.labels.tree()["classes"],
+        voxels=counts,
+        points_offset_m=list(source.extent.offset_m),
+        failed=failed,
+        **facts,
+    )
+    if epsg:
+        about["epsg"] = epsg
+    try:
+        with open(os.path.join(folder, ABOUT_FILE), "w", encoding="utf-8") as stream:
+            json.dump(about, stream, indent=2, sort_keys=True)
+            stream.write("\n")
+    except OSError as error:
+        failed["about"] = str(error)
+    return Exported(counts, failed)
 
 
 def written_files(folder: str) -> List[str]:
     """Names of a map's files in a folder, the map file first."""
-    names = [name for name in FILES if os.path.exists(os.path.join(folder, name))]
+    names = [name for name in formats.all_files() if os.path.exists(os.path.join(folder, name))]
     return sorted(names, key=lambda name: (name not in (MAP_FILE, ABOUT_FILE), name))

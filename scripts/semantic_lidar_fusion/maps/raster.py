@@ -1,43 +1,56 @@
 # SPDX-License-Identifier: MIT
 """2-D maps from voxels: ground, cost and class of each column of voxels.
 
+What a column costs follows from its geometry first: whatever rises from the ground is an obstacle,
+whatever its class; what lies on the ground costs what its class does; flat ground without a class is
+ground. Voxels that rays show to be gone (reading.layers_of) take no part.
+
 Grids are arrays [row, column] = [voxel y - min y, voxel x - min x]: row 0 is the southern edge, as
 in nav_msgs/OccupancyGrid. Image files have the northern row first.
 """
 
-import os
-from typing import Any, Callable, Dict, Iterable, Iterator, NamedTuple, Tuple
+from typing import Any, Dict, NamedTuple, Tuple
 
 import numpy as np
 
-from semantic_lidar_fusion.errors import ConfigError, DataError
+from semantic_lidar_fusion.errors import ConfigError
 from semantic_lidar_fusion.labels import NO_LABEL, LabelSet, load_yaml
-from semantic_lidar_fusion.maps.semantic_map import (
+from semantic_lidar_fusion.maps.ground import GROUND_BAND_M
+from semantic_lidar_fusion.maps.reading import (
     DYNAMIC,
+    GONE,
     STATIC,
-    MapConfig,
-    heights,
     labels_and_confidences,
+    layers_of,
 )
+from semantic_lidar_fusion.maps.records import free_voxels, heights
+from semantic_lidar_fusion.maps.semantic_map import MapConfig
 
 UNKNOWN = -1  # of a cost grid
 OCCUPIED = 100
-MAX_CELLS = 1 << 28
-# A cell without ground takes that of the nearest cell that has some, if it is not further (m).
-GROUND_REACH_M = 5.0
-# Something that moves stands there no more if the ground below it was seen so much later (ns).
-GONE_AFTER_NS = 300 * 10**6
+# A cell without voxels is free ground if rays crossed so many clouds' worth of it, so high above the
+# ground (m).
+FREE_PASSES, FREE_BAND_M = 2, (0.1, 1.0)
+# Poses further apart are not joined to one path (m).
+PATH_GAP_M = 5.0
+# What was last seen so much later than the vehicle was there has come since (ns); earlier, it drives
+# behind it.
+CAME_LATER_NS = 60 * 10**9
 
 
 class Costs(NamedTuple):
     """A cost file for a class set. cost: (C,) int, -1 = says nothing; min_probability: (C,); ground:
-    (C,) bool."""
+    (C,) bool. The other fields are explained in config/map_costs.yaml."""
 
     cost: np.ndarray
     min_probability: np.ndarray
     ground: np.ndarray
     min_obstacle_height_m: float
+    low_obstacle_height_m: float
     clearance_m: float
+    single_point_probability: float
+    min_points: int
+    unnamed_ground_cost: int
 
     @staticmethod
     def from_file(path: str, labels: LabelSet) -> "Costs":
@@ -49,11 +62,20 @@ class Costs(NamedTuple):
         problems = []
         if not isinstance(tree, dict):
             raise ConfigError("%s: must be a mapping" % source)
-        known = ("default", "min_obstacle_height_m", "clearance_m", "classes")
+        numbers = (
+            ("min_obstacle_height_m", 0.3, 1000.0),
+            ("low_obstacle_height_m", 0.15, 1000.0),
+            ("clearance_m", 2.5, 1000.0),
+            ("single_point_probability", 0.7, 1.0),
+            ("min_points", 2.0, 1000.0),
+            ("unnamed_ground_cost", 0.0, 100.0),
+        )
+        known = ("default", "classes", *(name for name, _, _ in numbers))
         problems += ["%s: unknown key" % key for key in tree if key not in known]
-        heights = []
-        for key, value in (("min_obstacle_height_m", 0.3), ("clearance_m", 2.5)):
-            heights.append(_number(tree.get(key, value), 0, 1000, key, problems))
+        values = [
+            _number(tree.get(key, default), 0, most, key, problems)
+            for key, default, most in numbers
+        ]
         entry = _entry(tree.get("default", {}), "default", problems)
         default = dict({"cost": 100, "min_probability": 0.5, "ground": False}, **entry)
         classes = tree.get("classes", {})
@@ -70,8 +92,12 @@ class Costs(NamedTuple):
             np.array([-1 if row["cost"] is None else row["cost"] for row in chosen], np.int16),
             np.array([row["min_probability"] for row in chosen], dtype=np.float64),
             np.array([row["ground"] for row in chosen], dtype=bool),
-            heights[0],
-            heights[1],
+            values[0],
+            values[1],
+            values[2],
+            values[3],
+            int(values[4]),
+            int(values[5]),
         )
 
 
@@ -114,14 +140,8 @@ class Frame2d(NamedTuple):
 
     @staticmethod
     def around(low: Tuple[int, int], high: Tuple[int, int], cell_m: float) -> "Frame2d":
-        """All voxels from low to high, inclusive; DataError if they are absurdly many."""
-        width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
-        if width * height > MAX_CELLS:
-            raise DataError(
-                "the map is %d x %d voxels wide, too much for a picture; limit the range of the "
-                "points, or leave the 2-D maps out" % (width, height)
-            )
-        return Frame2d(low[0], low[1], width, height, cell_m)
+        """All voxels from low to high, inclusive."""
+        return Frame2d(low[0], low[1], high[0] - low[0] + 1, high[1] - low[1] + 1, cell_m)
 
     @property
     def shape(self) -> Tuple[int, int]:
@@ -132,32 +152,49 @@ class Frame2d(NamedTuple):
         """The south-western corner (m)."""
         return self.min_x * self.cell_m, self.min_y * self.cell_m
 
+    def holds(self, records: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether each record's column is one of the grid's."""
+        x, y = (
+            records["x"].astype(np.int64) - self.min_x,
+            records["y"].astype(np.int64) - self.min_y,
+        )
+        return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
     def cells(self, records: np.ndarray) -> np.ndarray:
         """(N,) int64: index of each record's cell in the flattened grid."""
         row = records["y"].astype(np.int64) - self.min_y
         return row * self.width + (records["x"].astype(np.int64) - self.min_x)
 
 
-class Columns:
-    """Whole columns of voxels, sorted once by cell and height.
+class Rasters(NamedTuple):
+    """All 2-D maps of a part of a voxel map, (height, width) each. cost: int8, UNKNOWN = -1; label:
+    uint8 and confidence: float32 of the uppermost voxel with a class, of the static layer where that
+    has one; elevation_m: float32, the ground, NaN = not seen."""
 
-    Arrays (N,) in that order: cell, z (m), label, confidence, layer, last_ns; `starts`: the first
-    voxel of each column."""
+    frame: Frame2d
+    cost: np.ndarray
+    label: np.ndarray
+    confidence: np.ndarray
+    elevation_m: np.ndarray
 
-    def __init__(self, records: np.ndarray, config: MapConfig, frame: Frame2d):
-        cell = frame.cells(records)
-        order = np.argsort((cell << 32) + records["z"], kind="stable")
-        records = records[order]
-        self.cell = cell[order]
-        self.z = heights(records, config.voxel_size_m).astype(np.float32)
-        self.label, self.confidence = labels_and_confidences(records, config)
-        self.layer, self.last_ns = records["layer"], records["last_ns"]
-        self.starts = _starts(self.cell)
+    @staticmethod
+    def empty(frame: Frame2d) -> "Rasters":
+        return Rasters(
+            frame,
+            np.full(frame.shape, UNKNOWN, dtype=np.int8),
+            np.full(frame.shape, NO_LABEL, dtype=np.uint8),
+            np.zeros(frame.shape, dtype=np.float32),
+            np.full(frame.shape, np.nan, dtype=np.float32),
+        )
 
-    def sure(self, costs: "Costs") -> np.ndarray:
-        """(N,) bool: whose class is likely enough to count."""
-        label = np.minimum(self.label, len(costs.cost) - 1)
-        return (self.label != NO_LABEL) & (self.confidence >= costs.min_probability[label])
+    def paste(self, part: "Rasters") -> None:
+        """Takes over what a part holds inside this frame."""
+        mine, other = self.frame, part.frame
+        x, y = other.min_x - mine.min_x, other.min_y - mine.min_y
+        left, bottom = max(x, 0), max(y, 0)
+        right, top = min(x + other.width, mine.width), min(y + other.height, mine.height)
+        for target, source in zip(self[1:], part[1:]):
+            target[bottom:top, left:right] = source[bottom - y : top - y, left - x : right - x]
 
 
 def _starts(cells: np.ndarray) -> np.ndarray:
@@ -167,260 +204,154 @@ def _starts(cells: np.ndarray) -> np.ndarray:
     return np.flatnonzero(new)
 
 
-class Surfaces:
-    """Ground and uppermost class of each cell, gathered tile by tile.
-
-    ground_m: height of the lowest ground voxel, NaN = none; ground_ns: when ground was last seen;
-    lowest_m: lowest voxel; label, confidence: of the uppermost labelled voxel of the static layer
-    (of the other, where that has none)."""
-
-    def __init__(self, frame: Frame2d, costs: Costs):
-        self.frame, self._costs = frame, costs
-        count = frame.width * frame.height
-        self.ground_m = np.full(count, np.nan, dtype=np.float32)
-        self.lowest_m = np.full(count, np.nan, dtype=np.float32)
-        self.ground_ns = np.full(count, np.iinfo(np.int64).min)
-        self.label = np.full(count, NO_LABEL, dtype=np.uint8)
-        self.confidence = np.zeros(count, dtype=np.float32)
-
-    def add(self, columns: Columns) -> None:
-        """Columns that were not added before."""
-        if not len(columns.cell):
-            return
-        cells = columns.cell
-        self.lowest_m[cells[columns.starts]] = columns.z[columns.starts]
-        is_ground = self._costs.ground[np.minimum(columns.label, len(self._costs.ground) - 1)]
-        ground = np.flatnonzero(columns.sure(self._costs) & is_ground & (columns.layer == STATIC))
-        if len(ground):
-            starts = _starts(cells[ground])
-            first = ground[starts]
-            self.ground_m[cells[first]] = columns.z[first]
-            latest = np.maximum.reduceat(columns.last_ns[ground], starts)
-            self.ground_ns[cells[first]] = latest
-        # In ascending height: of equal cells the last assignment holds. Static ones go last.
-        for layer in (DYNAMIC, STATIC):
-            named = np.flatnonzero((columns.label != NO_LABEL) & (columns.layer == layer))
-            self.label[cells[named]] = columns.label[named]
-            self.confidence[cells[named]] = columns.confidence[named]
-
-    def reference_m(self) -> np.ndarray:
-        """(cells,) float32: the ground to measure heights from: its own, else that of the nearest
-        cell within GROUND_REACH_M, else the lowest voxel; NaN where there is nothing."""
-        import cv2
-
-        missing = np.isnan(self.ground_m).reshape(self.frame.shape)
-        if missing.all():
-            return self.lowest_m
-        distance, region = cv2.distanceTransformWithLabels(
-            missing.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        table = np.zeros(int(region.max()) + 1, dtype=np.float32)
-        known = ~missing
-        table[region[known]] = self.ground_m.reshape(self.frame.shape)[known]
-        filled = table[region].reshape(-1)
-        near = distance.reshape(-1) * self.frame.cell_m <= GROUND_REACH_M
-        return np.where(near, filled, self.lowest_m)
+def passed_at(path: np.ndarray, frame: Frame2d, half_width_m: float) -> np.ndarray:
+    """(height, width) int64: when the vehicle, `half_width_m` to each side of its path, was last
+    there; the least integer = never."""
+    never = np.iinfo(np.int64).min
+    result = np.full(frame.shape, never)
+    if half_width_m <= 0 or not len(path):
+        return result
+    points = np.stack([path["x"], path["y"]], axis=1)
+    reach = half_width_m + frame.cell_m
+    west, south = frame.origin
+    size = np.array([frame.width, frame.height]) * frame.cell_m
+    low_corner, high_corner = (
+        np.array([west, south]) - reach,
+        np.array([west, south]) + size + reach,
+    )
+    before = points[np.maximum(np.arange(len(points)) - 1, 0)]
+    meets = (np.maximum(points, before) >= low_corner) & (np.minimum(points, before) <= high_corner)
+    for number in np.flatnonzero(meets.all(axis=1)):
+        a, b = points[max(number - 1, 0)], points[number]
+        if np.hypot(*(b - a)) > PATH_GAP_M:
+            a = b
+        low = np.maximum(np.minimum(a, b) - reach - (west, south), 0.0)
+        high = np.minimum(np.maximum(a, b) + reach - (west, south), size)
+        if (low >= high).any():
+            continue
+        first = (low / frame.cell_m).astype(int)
+        last = np.minimum(np.ceil(high / frame.cell_m).astype(int), [frame.width, frame.height])
+        x = west + (np.arange(first[0], last[0]) + 0.5) * frame.cell_m
+        y = south + (np.arange(first[1], last[1]) + 0.5) * frame.cell_m
+        way = b - a
+        squared = max(float(way @ way), 1e-12)
+        dx, dy = x[None, :] - a[0], y[:, None] - a[1]
+        ratio = np.clip((dx * way[0] + dy * way[1]) / squared, 0.0, 1.0)
+        near = np.hypot(dx - ratio * way[0], dy - ratio * way[1]) <= half_width_m
+        part = result[first[1] : last[1], first[0] : last[0]]
+        part[near] = np.maximum(part[near], path["stamp_ns"][number])
+    return result
 
 
-class CostGrid:
-    """nav_msgs/OccupancyGrid values: 0 free to 100 occupied, -1 unknown; gathered tile by tile."""
-
-    def __init__(self, surfaces: Surfaces, costs: Costs):
-        self.frame, self._costs, self._surfaces = surfaces.frame, costs, surfaces
-        self._ground_m = surfaces.reference_m()
-        self.cost = np.full(len(self._ground_m), UNKNOWN, dtype=np.int8)
-
-    def add(self, columns: Columns) -> None:
-        """Columns that were not added before."""
-        if not len(columns.cell):
-            return
-        costs, cells = self._costs, columns.cell
-        above = columns.z - self._ground_m[cells]
-        label = np.minimum(columns.label, len(costs.cost) - 1)
-        cost = np.where(columns.sure(costs), costs.cost[label], UNKNOWN)
-        # What has no class is an obstacle if it rises from the ground.
-        rises = above > costs.min_obstacle_height_m
-        cost = np.where((cost == UNKNOWN) & rises, OCCUPIED, cost)
-        gone = self._surfaces.ground_ns[cells] > columns.last_ns + GONE_AFTER_NS
-        cost[(columns.layer == DYNAMIC) & gone] = UNKNOWN
-        cost[above > costs.clearance_m] = UNKNOWN
-        worst = np.maximum.reduceat(cost, columns.starts)
-        self.cost[cells[columns.starts]] = worst.astype(np.int8)
-
-    @property
-    def grid(self) -> np.ndarray:
-        """(height, width) int8."""
-        return self.cost.reshape(self.frame.shape)
+def _costs_of_voxels(
+    label: np.ndarray, confidence: np.ndarray, above_m: np.ndarray, costs: Costs
+) -> np.ndarray:
+    """(N,) int16: what each voxel costs by its height above the ground, then its class."""
+    index = np.minimum(label, len(costs.cost) - 1)
+    by_class = costs.cost[index]
+    sure = (label != NO_LABEL) & (confidence >= costs.min_probability[index]) & (by_class >= 0)
+    on_ground = sure & costs.ground[index]
+    cost = np.full(len(label), costs.unnamed_ground_cost, dtype=np.int16)
+    cost[on_ground] = by_class[on_ground]
+    low = sure & ~on_ground & (above_m > costs.low_obstacle_height_m)
+    cost[low] = by_class[low]
+    rises = above_m > costs.min_obstacle_height_m
+    cost[rises] = np.where(sure & ~on_ground, by_class, OCCUPIED)[rises]
+    # Without ground nearby only the class can tell.
+    adrift = np.isnan(above_m)
+    cost[adrift] = np.where(sure, by_class, UNKNOWN)[adrift]
+    cost[above_m > costs.clearance_m] = UNKNOWN
+    return cost
 
 
-class Rasters(NamedTuple):
-    """All 2-D maps of a voxel map, (height, width) each."""
-
-    frame: Frame2d
-    cost: np.ndarray
-    label: np.ndarray
-    confidence: np.ndarray
-    elevation_m: np.ndarray
-
-
-def rasterise(
-    tiles: Callable[[], Iterable[np.ndarray]], frame: Frame2d, config: MapConfig, costs: Costs
+def flatten(
+    records: np.ndarray,
+    bricks: np.ndarray,
+    frame: Frame2d,
+    ground_m: np.ndarray,
+    path: np.ndarray,
+    config: MapConfig,
+    labels: LabelSet,
+    costs: Costs,
 ) -> Rasters:
-    """2-D maps from two passes over the tiles."""
-    surfaces = Surfaces(frame, costs)
-    for records in tiles():
-        surfaces.add(Columns(records, config, frame))
-    costs_of_cells = CostGrid(surfaces, costs)
-    for records in tiles():
-        costs_of_cells.add(Columns(records, config, frame))
-    elevation = np.where(np.isnan(surfaces.ground_m), surfaces.lowest_m, surfaces.ground_m)
+    """The 2-D maps of whole columns of voxels, all inside `frame`, above the ground (height, width)."""
+    ground = ground_m.reshape(-1)
+    passed = passed_at(path, frame, config.footprint_m).reshape(-1)
+    order = np.argsort(
+        (frame.cells(records) << 32) + (records["z"].astype(np.int64) + (1 << 30)), kind="stable"
+    )
+    records = records[order]
+    label, confidence = labels_and_confidences(records, config, labels)
+    above = (heights(records, config.voxel_size_m) - ground[frame.cells(records)]).astype(
+        np.float32
+    )
+    is_ground = above <= GROUND_BAND_M
+    layer = layers_of(records, label, confidence, config, labels, is_ground)
+    there = layer != GONE
+    records, label, confidence = records[there], label[there], confidence[there]
+    above, layer, is_ground = above[there], layer[there], is_ground[there]
+    cells = frame.cells(records)
+    cost = _costs_of_voxels(label, confidence, above, costs)
+    # Where the vehicle has been since, nothing was.
+    blocks = (cost > 0) & ~is_ground
+    cost[blocks & (records["last_ns"] <= passed[cells] + CAME_LATER_NS)] = UNKNOWN
+    # A column needs so many points of what rises in it, or one that is sure of its class.
+    count = frame.width * frame.height
+    rising = above > costs.min_obstacle_height_m
+    points = np.bincount(cells[rising], records["observations"][rising], count)
+    on_ground = (label != NO_LABEL) & costs.ground[np.minimum(label, len(costs.ground) - 1)]
+    sure = ~on_ground & (confidence >= costs.single_point_probability)
+    cost[rising & ~sure & (points[cells] < costs.min_points)] = UNKNOWN
+    grid = np.full(count, UNKNOWN, dtype=np.int8)
+    starts = _starts(cells)
+    if len(cells):
+        grid[cells[starts]] = np.maximum.reduceat(cost, starts)
+    free = (passed != np.iinfo(np.int64).min) | _crossed(bricks, frame, ground, config)
+    grid[(grid == UNKNOWN) & free] = costs.unnamed_ground_cost
     return Rasters(
         frame,
-        costs_of_cells.grid,
-        surfaces.label.reshape(frame.shape),
-        surfaces.confidence.reshape(frame.shape),
-        elevation.reshape(frame.shape),
+        grid.reshape(frame.shape),
+        *_uppermost(frame, cells, label, confidence, layer),
+        _elevation(frame, cells, above, ground),
     )
 
 
-def extent(tiles: Iterable[np.ndarray]) -> Iterator[Tuple[int, int, int, int]]:
-    """(min x, min y, max x, max y) of each tile."""
-    for records in tiles:
-        if len(records):
-            x, y = records["x"], records["y"]
-            yield int(x.min()), int(y.min()), int(x.max()), int(y.max())
+def _uppermost(
+    frame: Frame2d, cells: np.ndarray, label: np.ndarray, confidence: np.ndarray, layer: np.ndarray
+) -> Tuple[np.ndarray, np.ndarray]:
+    """Label and confidence of each cell, of voxels in ascending height."""
+    count = frame.width * frame.height
+    labels, confidences = np.full(count, NO_LABEL, dtype=np.uint8), np.zeros(count, np.float32)
+    # Of equal cells the last assignment holds. Static ones go last.
+    for wanted in (DYNAMIC, STATIC):
+        named = np.flatnonzero((label != NO_LABEL) & (layer == wanted))
+        labels[cells[named]] = label[named]
+        confidences[cells[named]] = confidence[named]
+    return labels.reshape(frame.shape), confidences.reshape(frame.shape)
 
 
-def write_pgm(path: str, image: np.ndarray) -> None:
-    """An 8-bit grey image, northern row first."""
-    with open(path, "wb") as file:
-        file.write(b"P5\n%d %d\n255\n" % (image.shape[1], image.shape[0]))
-        file.write(np.ascontiguousarray(image, dtype=np.uint8))
+def _elevation(
+    frame: Frame2d, cells: np.ndarray, above: np.ndarray, ground: np.ndarray
+) -> np.ndarray:
+    """(height, width) float32: the height of the lowest voxel, where that belongs to the ground."""
+    result = np.full(len(ground), np.nan, dtype=np.float32)
+    starts = _starts(cells)
+    lowest = starts[above[starts] <= GROUND_BAND_M] if len(cells) else starts[:0]
+    result[cells[lowest]] = above[lowest] + ground[cells[lowest]]
+    return result.reshape(frame.shape)
 
 
-def _map_server_yaml(image: str, frame: Frame2d, mode: str) -> str:
-    return (
-        "image: %s\nresolution: %.9g\norigin: [%.9f, %.9f, 0.0]\nnegate: 0\n"
-        "occupied_thresh: 0.65\nfree_thresh: 0.196\nmode: %s\n"
-        % (image, frame.cell_m, frame.origin[0], frame.origin[1], mode)
-    )
-
-
-def write_occupancy(folder: str, rasters: Rasters) -> None:
-    """Two maps for map_server: costs.yaml (mode raw: every cost, 255 = unknown) and occupancy.yaml
-    (mode trinary, for programs that know no other: free below the cost 65, occupied from there)."""
-    cost = rasters.cost[::-1]
-    write_pgm(os.path.join(folder, "costs.pgm"), cost.astype(np.uint8))
-    grey = np.where(cost < 0, 205, np.where(cost >= 65, 0, 254))
-    write_pgm(os.path.join(folder, "occupancy.pgm"), grey)
-    for name, mode in (("costs", "raw"), ("occupancy", "trinary")):
-        with open(os.path.join(folder, name + ".yaml"), "w", encoding="utf-8") as file:
-            file.write(_map_server_yaml(name + ".pgm", rasters.frame, mode))
-
-
-ELEVATION_STEP_M = 0.01
-
-
-def write_rasters(folder: str, rasters: Rasters, labels: LabelSet) -> Dict[str, Any]:
-    """classes.png (class colours, transparent = none), labels.png (ids, 255 = none),
-    confidence.png (255 = certain) and elevation.png (16 bits), with world files. Returns how to read
-    the elevation."""
-    colors = np.zeros((256, 4), dtype=np.uint8)
-    colors[: len(labels), :3] = labels.colors_rgb[:, ::-1]
-    colors[: len(labels), 3] = 255
-    elevation = rasters.elevation_m.astype(np.float64)
-    known = ~np.isnan(elevation)
-    lowest = float(np.floor(elevation[known].min())) if known.any() else 0.0
-    steps = np.rint((np.where(known, elevation, lowest) - lowest) / ELEVATION_STEP_M) + 1
-    images = {
-        "classes.png": colors[rasters.label],
-        "labels.png": rasters.label,
-        "confidence.png": np.rint(rasters.confidence * 255).astype(np.uint8),
-        "elevation.png": np.where(known, np.clip(steps, 1, 65535), 0).astype(np.uint16),
-    }
-    frame = rasters.frame
-    # Centre of the upper left pixel.
-    left = (frame.min_x + 0.5) * frame.cell_m
-    top = (frame.min_y + frame.height - 0.5) * frame.cell_m
-    world = "%.9f\n0.0\n0.0\n%.9f\n%.9f\n%.9f\n" % (frame.cell_m, -frame.cell_m, left, top)
-    for name, image in images.items():
-        _write_png(os.path.join(folder, name), image[::-1])
-        with open(os.path.join(folder, name[:-4] + ".pgw"), "w", encoding="ascii") as file:
-            file.write(world)
-    return {
-        "unknown": 0,
-        "metres": "offset_m + step_m * value",
-        "step_m": ELEVATION_STEP_M,
-        "offset_m": lowest - ELEVATION_STEP_M,
-    }
-
-
-def _write_png(path: str, image: np.ndarray) -> None:
-    import cv2
-
-    try:
-        good = cv2.imwrite(path, np.ascontiguousarray(image))
-    except cv2.error as error:
-        raise DataError("%s: cannot be written (%s)" % (path, error)) from error
-    if not good:
-        raise DataError("%s: cannot be written" % path)
-
-
-_EMPTY_RGB = (214, 222, 232)
-_UNNAMED_RGB = (165, 172, 180)
-
-
-def _core(known: np.ndarray) -> Tuple[slice, slice]:
-    """Rows and columns of a grid that hold nearly all of its known cells: single far points would
-    make the picture small."""
-    result = []
-    for axis in (1, 0):
-        share = np.cumsum(known.sum(axis=axis)) / max(int(known.sum()), 1)
-        first, last = np.searchsorted(share, [0.003, 0.997])
-        result.append(slice(max(0, int(first) - 5), int(last) + 6))
-    return result[0], result[1]
-
-
-def draw_picture(path: str, rasters: Rasters, labels: LabelSet, title: str) -> None:
-    """The map from above in class colours, paler where it is less sure, with a legend."""
-    from matplotlib.patches import Patch
-
-    from semantic_lidar_fusion.figures import plotting
-
-    pyplot = plotting.pyplot()
-    frame = rasters.frame
-    rows, columns = _core(~np.isnan(rasters.elevation_m))
-    label = rasters.label[rows, columns]
-    # Neither white nor grey: classes may have these colours.
-    image = np.full(label.shape + (3,), _EMPTY_RGB, dtype=np.uint8)
-    named = label != NO_LABEL
-    color = labels.colors_rgb[np.minimum(label, len(labels) - 1)].astype(np.float64)
-    strength = 0.35 + 0.65 * rasters.confidence[rows, columns][..., None]
-    image[named] = (color * strength + np.array(_EMPTY_RGB) * (1 - strength))[named].round()
-    image[~named & ~np.isnan(rasters.elevation_m[rows, columns])] = _UNNAMED_RGB
-    west = (frame.min_x + columns.start) * frame.cell_m
-    south = (frame.min_y + rows.start) * frame.cell_m
-    east, north = west + label.shape[1] * frame.cell_m, south + label.shape[0] * frame.cell_m
-    ratio = label.shape[0] / label.shape[1]
-    width = 11.0 if ratio < 1 else max(5.0, 9.0 / ratio)
-    figure, axes = pyplot.subplots(figsize=(width, min(11.0, max(3.0, width * ratio + 1.6))))
-    axes.imshow(image, origin="lower", extent=(west, east, south, north), interpolation="nearest")
-    axes.set_title(title)
-    axes.set_xlabel("x (m)")
-    axes.set_ylabel("y (m)")
-    axes.ticklabel_format(useOffset=False, style="plain")
-    shown = [i for i in range(len(labels)) if (label == i).any()]
-    handles = [
-        Patch(facecolor=labels.colors_rgb[i] / 255.0, edgecolor="0.5", label=labels[i].name)
-        for i in shown
-    ]
-    unnamed = np.array(_UNNAMED_RGB) / 255.0
-    handles.append(Patch(facecolor=unnamed, edgecolor="0.5", label="no class"))
-    axes.legend(
-        handles=handles,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.32 if ratio < 0.3 else -0.12),
-        ncol=min(len(handles), 7),
-        frameon=False,
-    )
-    plotting.save(figure, path)
+def _crossed(
+    bricks: np.ndarray, frame: Frame2d, ground: np.ndarray, config: MapConfig
+) -> np.ndarray:
+    """(cells,) bool: rays crossed it closely above the ground."""
+    result = np.zeros(len(ground), dtype=bool)
+    if not len(bricks):
+        return result
+    voxels, passes = free_voxels(bricks)
+    x, y = voxels[:, 0] - frame.min_x, voxels[:, 1] - frame.min_y
+    inside = (x >= 0) & (x < frame.width) & (y >= 0) & (y < frame.height) & (passes >= FREE_PASSES)
+    cell = (y * frame.width + x)[inside]
+    above = (voxels[inside, 2] + 0.5) * config.voxel_size_m - ground[cell]
+    result[cell[(above >= FREE_BAND_M[0]) & (above <= FREE_BAND_M[1])]] = True
+    return result

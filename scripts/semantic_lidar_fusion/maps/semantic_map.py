@@ -1,61 +1,56 @@
 # SPDX-License-Identifier: MIT
-"""Voxel maps of class distributions: what they hold, how points enter, and how voxels are read.
+"""Voxel maps of class distributions: how they are configured, and how points enter.
 
-A map is a set of records of whole numbers (`record_dtype`), kept by the compiled module
-semantic_lidar_fusion._voxel_map (include/semantic_lidar_fusion/map/voxel_map.h) or, with the same
-bytes, by numpy (numpy_map). Nothing in a record depends on the order of its points; maps
-of parts of a drive add up to the map of the whole. Only reading (`Reading`) normalises and clamps.
+A map is a set of records of whole numbers and the space that rays crossed (`records`), kept by the
+compiled module semantic_lidar_fusion._voxel_map (include/semantic_lidar_fusion/map/voxel_map.h) or,
+with the same bytes, by numpy (numpy_map). What points leave does not depend on their order; rays
+count what came after, so that clouds and maps are added in the order of time. Only `reading`
+normalises, clamps and judges.
 
 Lengths are m in the map frame, times integer ns.
 """
 
 import dataclasses
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
+import importlib
+from typing import Any, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
 from semantic_lidar_fusion.bags.cloud_io import SemanticCloud
 from semantic_lidar_fusion.errors import ConfigError, DataError
-from semantic_lidar_fusion.labels import NO_LABEL, LabelSet
+from semantic_lidar_fusion.labels import LabelSet
+from semantic_lidar_fusion.maps.numpy_map import NumpyVoxelMap
+from semantic_lidar_fusion.maps.records import BRICK, record_dtype
 
-EVIDENCE_BITS = 20
-UNIT = float(1 << EVIDENCE_BITS)  # of evidence, positions (m) and intensities
-STATIC, DYNAMIC = 0, 1  # layers
-TILE_BITS = 8  # a tile is 256 voxels wide in x and y
-COUNTS = ("labelled", "occupied", "no_odometry", "out_of_range", "excluded", "invalid")
-
-
-def record_dtype(class_count: int) -> np.dtype:
-    """A voxel's record (72 + 8 C bytes): voxel index x y z; layer; observations (points of status 0
-    to 3), of which labelled (status 0); sums of the offset from the voxel's corner (2^-20 m) and of
-    the intensity (2^-20); stamps of the first and last cloud; evidence of each class (2^-20)."""
-    return np.dtype(
-        [("x", "<i4"), ("y", "<i4"), ("z", "<i4")]
-        + [("layer", "<u4"), ("observations", "<u4"), ("labelled", "<u4")]
-        + [("sum_x", "<i8"), ("sum_y", "<i8"), ("sum_z", "<i8"), ("sum_intensity", "<i8")]
-        + [("first_ns", "<i8"), ("last_ns", "<i8"), ("evidence", "<i8", (class_count,))]
-    )
+COUNTS = ("labelled", "occupied", "no_odometry", "out_of_range", "invalid")
+# Fields of MapConfig that act on reading alone.
+_READING = ("clamp", "dynamic", "footprint_m")
 
 
 @dataclasses.dataclass(frozen=True)
 class MapConfig:
-    """How a map is made and read. Maps that differ in nothing but `clamp` can be added.
+    """How a map is made and read. Maps that differ in what acts on reading alone can be added.
 
-    kind: "log" adds w (ln max(P, floor) - ln prior), "dirichlet" adds w P per class.
-    prior: one per class, sum 1; None = uniform. dynamic: "apart" gives points of the class set's
-    dynamic classes a layer of their own, "exclude" drops them, "keep" treats them like others.
-    clamp: reading only; no class is taken for less likely than the best one by more than a factor
-    exp(clamp) (log) - or the sum of the prior counts (dirichlet)."""
+    kind: "log" adds w (ln max(P, floor) - ln prior) for each look, "dirichlet" adds w P.
+    prior: one per class, sum 1; None = uniform. ray_range_m: how far from the lidar rays clear;
+    0 = no rays.
+    Reading only: clamp: no class is taken for less likely than the best one by more than a factor
+    exp(clamp) (log) - or the sum of the prior counts (dirichlet). dynamic: "apart" gives voxels of
+    the class set's dynamic classes a layer of their own, "exclude" leaves them out, "keep" treats
+    them like others. footprint_m: half the width of the vehicle, whose path is free in 2-D maps;
+    0 = it is not."""
 
     voxel_size_m: float = 0.2
     kind: str = "log"
-    weight: float = 0.7
-    floor: float = 1e-3
+    weight: float = 1.0
+    floor: float = 1e-2
     prior: Optional[Tuple[float, ...]] = None
     clamp: float = 5.0
     min_range_m: float = 0.0
-    max_range_m: float = 0.0
+    max_range_m: float = 120.0
+    ray_range_m: float = 45.0
     dynamic: str = "apart"
+    footprint_m: float = 0.9
 
     def problems(self, class_count: int) -> List[str]:
         """What is wrong, one sentence each."""
@@ -76,6 +71,8 @@ class MapConfig:
             self.max_range_m == 0 or self.max_range_m > self.min_range_m,
             "0 (no limit) or above min_range_m",
         )
+        check("ray_range_m", 0 <= self.ray_range_m <= 1e4, "from 0 (no rays) to 10000")
+        check("footprint_m", 0 <= self.footprint_m <= 20, "from 0 to 20")
         check("dynamic", self.dynamic in ("apart", "exclude", "keep"), "apart, exclude or keep")
         if self.prior is not None:
             check("prior", len(self.prior) == class_count, "of %d classes" % class_count)
@@ -106,16 +103,16 @@ class MapConfig:
 
     def can_add(self, other: "MapConfig") -> bool:
         """Whether the evidence of two maps means the same."""
-        return dataclasses.replace(self, clamp=1.0) == dataclasses.replace(other, clamp=1.0)
+        alike = {name: getattr(self, name) for name in _READING}
+        return self == dataclasses.replace(other, **alike)
 
 
 def native_module() -> Optional[Any]:
     """semantic_lidar_fusion._voxel_map, or None where it is not built."""
     try:
-        from semantic_lidar_fusion import _voxel_map
+        return importlib.import_module("semantic_lidar_fusion._voxel_map")
     except ImportError:
         return None
-    return _voxel_map
 
 
 class VoxelMap:
@@ -130,8 +127,8 @@ class VoxelMap:
         if native and module is None:
             raise ConfigError("the module semantic_lidar_fusion._voxel_map is not built")
         self.native = module is not None
-        dynamic = [1 if info.dynamic else 0 for info in labels.classes]
-        arguments = (
+        make = NumpyVoxelMap if module is None else module.VoxelMap
+        self._map: Any = make(
             self.config.voxel_size_m,
             self.config.kind == "dirichlet",
             self.config.weight,
@@ -139,15 +136,9 @@ class VoxelMap:
             list(self.config.prior or ()),
             self.config.min_range_m,
             self.config.max_range_m,
-            dynamic,
-            self.config.dynamic,
+            self.config.ray_range_m,
+            [int(value) for value in labels.returns],
         )
-        if module is not None:
-            self._map = module.VoxelMap(*arguments)
-        else:
-            from semantic_lidar_fusion.maps.numpy_map import NumpyVoxelMap
-
-            self._map = NumpyVoxelMap(*arguments)
 
     def __len__(self) -> int:
         """Number of voxels."""
@@ -157,9 +148,12 @@ class VoxelMap:
     def memory_bytes(self) -> int:
         return int(self._map.memory_bytes)
 
-    def integrate(self, cloud: SemanticCloud, pose: np.ndarray) -> Dict[str, int]:
+    def integrate(
+        self, cloud: SemanticCloud, pose: np.ndarray, origins: Optional[np.ndarray] = None
+    ) -> Dict[str, int]:
         """Adds a cloud seen from the pose T_map_lidar (4, 4) at its stamp; what became of its points
-        (`COUNTS`). DataError if the cloud has other classes."""
+        (`COUNTS`). `origins` (N, 3): where the lidar was when it measured each point, in the map
+        frame; None: at the pose. DataError if the cloud has other classes."""
         if cloud.class_names != self.labels.names:
             raise DataError(
                 "the cloud's classes are %s; the map's are %s"
@@ -173,10 +167,10 @@ class VoxelMap:
             [points[axis] for axis in "xyz"],
             intensity,
             cloud.status,
-            cloud.label,
             cloud.probabilities,
             pose,
             cloud.stamp_ns,
+            origins,
         )
 
     def integrate_columns(
@@ -184,38 +178,48 @@ class VoxelMap:
         xyz: Sequence[np.ndarray],
         intensity: np.ndarray,
         status: np.ndarray,
-        label: np.ndarray,
         probabilities: np.ndarray,
         pose: np.ndarray,
         stamp_ns: int,
+        origins: Optional[np.ndarray] = None,
     ) -> Dict[str, int]:
-        """The same for columns: x, y, z and intensity (N,) float32, status and label (N,) uint8,
+        """The same for columns: x, y, z and intensity (N,) float32, status (N,) uint8,
         probabilities (N, C) float32."""
 
         def as_type(values: np.ndarray, dtype: Any) -> np.ndarray:
             return values if values.dtype == dtype else values.astype(dtype)
 
         columns = [as_type(np.asarray(v), np.float32) for v in (*xyz, intensity)]
-        columns += [as_type(np.asarray(v), np.uint8) for v in (status, label)]
+        columns.append(as_type(np.asarray(status), np.uint8))
         probabilities = as_type(np.asarray(probabilities), np.float32)
         if probabilities.shape[1] > 1 and probabilities.strides[1] != 4:
             probabilities = np.ascontiguousarray(probabilities)
         pose = np.ascontiguousarray(pose, dtype=np.float64)
         if not np.isfinite(pose).all():
             raise DataError("the pose of a cloud is not finite")
-        result = self._map.integrate(*columns, probabilities, pose, int(stamp_ns))
+        begin = np.zeros((0, 3)) if origins is None else origins
+        begin = np.ascontiguousarray(begin, dtype=np.float64)
+        result = self._map.integrate(*columns, probabilities, pose, int(stamp_ns), begin)
         return dict(zip(COUNTS, (int(value) for value in result)))
 
-    def add(self, records: np.ndarray) -> None:
-        """Adds records (N,) of a map with the same configuration."""
-        if records.dtype != self.dtype:
+    def add(self, records: np.ndarray, bricks: Optional[np.ndarray] = None) -> None:
+        """Adds records (N,) and bricks (M,) of a later map with the same configuration."""
+        bricks = np.zeros(0, dtype=BRICK) if bricks is None else bricks
+        if records.dtype != self.dtype or bricks.dtype != BRICK:
             raise DataError("map: records of other classes")
-        self._map.add(np.ascontiguousarray(records).view(np.uint8).reshape(-1))
+        parts = [
+            np.ascontiguousarray(part).view(np.uint8).reshape(-1) for part in (records, bricks)
+        ]
+        self._map.add(*parts)
 
     def records(self, in_order: bool = True) -> np.ndarray:
-        """(N,) of `record_dtype`; in canonical order (tile in x, tile in y, layer, then x, y, z)
-        equal maps give equal bytes."""
+        """(N,) of `record_dtype`; in canonical order (tile in x, tile in y, then x, y, z) equal maps
+        give equal bytes."""
         return self._map.records(in_order).view(self.dtype)
+
+    def bricks(self, in_order: bool = True) -> np.ndarray:
+        """(M,) of BRICK: crossed voxels without a record, likewise."""
+        return self._map.bricks(in_order).view(BRICK)
 
     def keep_inside(self, low: Sequence[int], high: Sequence[int]) -> None:
         """Forgets voxels outside [low, high], voxel indices x, y, z."""
@@ -223,106 +227,3 @@ class VoxelMap:
 
     def clear(self) -> None:
         self._map.clear()
-
-
-def canonical_order(records: np.ndarray) -> np.ndarray:
-    """Indices (N,) that sort records: tile in x, tile in y, layer, x, y, z."""
-    x, y = records["x"], records["y"]
-    keys = (records["z"], y, x, records["layer"], y >> TILE_BITS, x >> TILE_BITS)
-    return np.lexsort(keys)
-
-
-class Reading(NamedTuple):
-    """What N records say.
-
-    position: (N, 3) float64, mean of the points; intensity: (N,) float32, mean;
-    probabilities: (N, C) float32; label: (N,) uint8, lowest id on ties, 255 = none; confidence:
-    (N,) float32, its probability; entropy: (N,) float32, H / ln C. A voxel without labelled points
-    has probabilities and confidence 0 and entropy 1."""
-
-    position: np.ndarray
-    intensity: np.ndarray
-    probabilities: np.ndarray
-    label: np.ndarray
-    confidence: np.ndarray
-    entropy: np.ndarray
-
-
-def voxel_indices(records: np.ndarray) -> np.ndarray:
-    """(N, 3) int64."""
-    return np.stack([records[axis].astype(np.int64) for axis in "xyz"], axis=1)
-
-
-def positions(records: np.ndarray, voxel_size_m: float) -> np.ndarray:
-    """(N, 3) float64: mean position of the points of each voxel."""
-    count = np.maximum(records["observations"], 1).astype(np.float64)
-    result = voxel_indices(records) * voxel_size_m
-    for column, axis in enumerate("xyz"):
-        result[:, column] += records["sum_" + axis] / UNIT / count
-    return result
-
-
-def heights(records: np.ndarray, voxel_size_m: float) -> np.ndarray:
-    """(N,) float64: z of `positions`."""
-    count = np.maximum(records["observations"], 1).astype(np.float64)
-    return records["z"] * voxel_size_m + records["sum_z"] / UNIT / count
-
-
-def distributions(records: np.ndarray, config: MapConfig) -> np.ndarray:
-    """(N, C) float64 of records with labelled points; others give the prior."""
-    evidence = records["evidence"] / UNIT
-    prior = np.asarray(config.prior, dtype=np.float64)
-    if config.kind == "dirichlet":
-        counts = np.maximum(evidence, 0.0) + prior
-    else:
-        logarithms = evidence + np.log(prior)
-        if len(records):
-            logarithms -= logarithms.max(axis=1, keepdims=True)
-        counts = np.exp(np.maximum(logarithms, -config.clamp))
-    return counts / counts.sum(axis=1, keepdims=True)
-
-
-def labels_of(records: np.ndarray, config: MapConfig) -> np.ndarray:
-    """(N,) uint8: most likely class, lowest id on ties, 255 = none."""
-    # From the whole numbers themselves: rounding cannot decide it.
-    prior = np.asarray(config.prior)
-    bias = np.log(prior) if config.kind == "log" else prior
-    evidence = records["evidence"] + np.rint(bias * UNIT).astype(np.int64)
-    label = np.argmax(evidence, axis=1).astype(np.uint8)
-    return np.where(records["labelled"] > 0, label, NO_LABEL).astype(np.uint8)
-
-
-def labels_and_confidences(records: np.ndarray, config: MapConfig) -> Tuple[np.ndarray, np.ndarray]:
-    """(N,) uint8 and (N,) float32 of `read`, without the rest (single precision throughout)."""
-    label = labels_of(records, config)
-    labelled = label != NO_LABEL
-    p = (records["evidence"] * np.float32(1 / UNIT)).astype(np.float32)
-    if config.kind == "dirichlet":
-        p = np.maximum(p, 0) + np.asarray(config.prior, dtype=np.float32)
-    else:
-        p += np.log(np.asarray(config.prior)).astype(np.float32)
-        p -= p.max(axis=1, keepdims=True)
-        np.maximum(p, np.float32(-config.clamp), out=p)
-        np.exp(p, out=p)
-    best = p[np.arange(len(p)), np.minimum(label, p.shape[1] - 1)]
-    return label, np.where(labelled, best / p.sum(axis=1), np.float32(0)).astype(np.float32)
-
-
-def read(records: np.ndarray, config: MapConfig) -> Reading:
-    """Reads records of a map with this (checked) configuration."""
-    label = labels_of(records, config)
-    labelled = label != NO_LABEL
-    p = distributions(records, config)
-    confidence = p[np.arange(len(p)), np.minimum(label, p.shape[1] - 1)]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        entropy = -np.sum(np.where(p > 0, p * np.log(p), 0.0), axis=1)
-    entropy = entropy / np.log(p.shape[1]) if p.shape[1] > 1 else np.zeros(len(p))
-    count = np.maximum(records["observations"], 1)
-    return Reading(
-        positions(records, config.voxel_size_m),
-        (records["sum_intensity"] / UNIT / count).astype(np.float32),
-        np.where(labelled[:, None], p, 0.0).astype(np.float32),
-        label,
-        np.where(labelled, confidence, 0.0).astype(np.float32),
-        np.where(labelled, np.clip(entropy, 0.0, 1.0), 1.0).astype(np.float32),
-    )
