@@ -4,6 +4,7 @@
 the recorder, and evaluates what it wrote. replay.launch starts it; its exit ends the launch."""
 
 import argparse
+import atexit
 import os
 import sys
 
@@ -47,6 +48,7 @@ def main():
     cli.require("numpy", "yaml", "rospy", "rosgraph")
     from semantic_lidar_fusion.bags import replay
 
+    atexit.register(replay.end_launch)  # after an error's line too
     replay.finish(options)
 
 

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""The end of a replay: what finish_replay.py does, as a node beside player, chain and recorder."""
+"""Start and end of a replay: what start_replay.py and finish_replay.py do, as nodes beside player,
+chain and recorder."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
 import time
 import xmlrpc.client
-from typing import Any, Callable, Dict, Optional
+from typing import Any, Callable, Dict, List, Optional, Set, Tuple
 
+import genpy.dynamic
 import rosgraph
 import rospy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -52,6 +55,17 @@ class Reports:
                 if key.startswith("dropped: ")
             }
 
+    def timed_out(self) -> Dict[str, int]:
+        """Camera -> scans in which a deadline decided about it."""
+        found: Dict[str, int] = {}
+        with self._lock:
+            for values in self._values.values():
+                for key, value in values.items():
+                    camera, _, end = key.partition(": ")
+                    if end in ("timed out", "no image, timed out"):
+                        found[camera] = found.get(camera, 0) + int(value)
+        return {camera: scans for camera, scans in sorted(found.items()) if scans}
+
 
 def _node(name: str) -> Optional[xmlrpc.client.ServerProxy]:
     """A node that runs, or None."""
@@ -79,7 +93,7 @@ def _longest_wait_s(rig: Rig) -> float:
     """The time after the last message of a bag in which its last scan may still come out."""
     timeouts = [camera.timeout_s for camera in rig.cameras]
     timeouts += [rig.number("reference.timeout"), rig.number("odometry.timeout")]
-    return CLOCK_STALL_S + 3 * max(timeouts) + REPORT_LAG_S
+    return CLOCK_STALL_S + 5 * max(timeouts) + REPORT_LAG_S
 
 
 def _wait_for_last_scans(reports: Reports, topic: str, quiet_s: float) -> None:
@@ -108,6 +122,23 @@ def _end_recorder(path: str) -> str:
     return path
 
 
+def _summary(reports: Reports, topic: str) -> str:
+    """What came out and what did not, in lines."""
+
+    def listed(counts: Dict[str, int]) -> str:
+        return ", ".join("%s (%d)" % item for item in counts.items()) or "nothing"
+
+    lines = ["%d clouds on %s" % (reports.published(topic), topic)]
+    lines.append("dropped: " + listed(reports.dropped()))
+    timed_out = reports.timed_out()
+    if timed_out:
+        lines.append(
+            "cameras that timed out (scans): %s; their images or scores are missing, or come later "
+            "than the rig's `timeout`: play slower, or raise it" % listed(timed_out)
+        )
+    return "\n".join(lines)
+
+
 def _evaluate(options: Any, recorded: str, settings: list) -> None:
     command = [
         sys.executable,
@@ -134,12 +165,110 @@ def finish(options: Any) -> None:
         raise DataError("%s does not run: can the bag be read? See its message above" % player)
     _wait(lambda: _node(player) is None)
     _wait_for_last_scans(reports, output, _longest_wait_s(rig))
-    dropped = reports.dropped()
-    print(
-        "%d clouds on %s, dropped: %s" % (reports.published(output), output, dropped or "nothing")
-    )
+    print(_summary(reports, output))
     sys.stdout.flush()
     if options.recorded:
         recorded = _end_recorder(options.recorded)
         if options.evaluate:
             _evaluate(options, recorded, settings)
+
+
+def end_launch() -> None:
+    """Ends the roslaunch that started this process as Ctrl-C does: a node that is `required` would
+    end it too, but with a red line even where all is well."""
+    parent = os.getppid()
+    try:
+        with open("/proc/%d/cmdline" % parent, "rb") as file:
+            is_roslaunch = b"roslaunch" in file.read()
+    except OSError:
+        return
+    if is_roslaunch:
+        os.kill(parent, signal.SIGINT)
+
+
+def _links_out(name: str) -> Set[Tuple[str, str]]:
+    """(listener, topic) of each live connection of a node that runs."""
+    try:
+        node = _node(name)
+        info = node.getBusInfo(rospy.get_name())[2] if node else []
+    except (OSError, xmlrpc.client.Error):
+        return set()
+    return {(e[1], e[4]) for e in info if e[2] == "o" and (len(e) < 6 or e[5])}
+
+
+def _missing_links(player: str, manager: str, rig: Rig, recorded: bool) -> List[str]:
+    """What is not connected yet, in words; a chain to whose output nobody listens sleeps."""
+    try:
+        publishers, subscribers = rosgraph.Master(rospy.get_name()).getSystemState()[:2]
+    except (rosgraph.MasterException, OSError):
+        return ["the ROS master"]
+    listeners = {topic: set(nodes) for topic, nodes in subscribers}
+    from_player, from_manager = _links_out(player), _links_out(manager)
+    output = rospy.resolve_name("points_semantic")
+    missing = []
+    recorder = rospy.resolve_name("recorder")
+    if recorded and (recorder, output) not in from_manager:
+        missing.append("%s on %s" % (recorder, output))
+    if listeners.get(output):
+        inner = ["scan_reference", "points_compensated"]
+        inner += [str(c["namespace"]).strip("/") + "/selection" for c in rig.tree["cameras"]]
+        for topic in map(rospy.resolve_name, inner):
+            if (manager, topic) not in from_manager:
+                missing.append("%s on %s" % (manager, topic))
+        lidar = rospy.resolve_name(rig.text("lidar.topic"))
+        if (manager, lidar) not in from_player:
+            missing.append("%s on %s" % (manager, lidar))
+    for topic, nodes in publishers:
+        if player in nodes:
+            for node in listeners.get(topic, ()):
+                if (node, topic) not in from_player and _node(node):
+                    missing.append("%s on %s" % (node, topic))
+    return missing
+
+
+def start(options: Any) -> None:
+    """Lets the waiting player go once chain and recorder are connected; see start_replay.py."""
+    rig = Rig.load(options.rig, options.overrides.split())
+    rospy.init_node("start_replay", disable_signals=False)
+    player, manager = rospy.resolve_name("player"), rospy.resolve_name(options.manager)
+    if not _wait(lambda: _node(player), options.player_within):
+        raise DataError("%s does not run: can the bag be read? See its message above" % player)
+    missing: List[str] = []
+
+    def is_connected() -> bool:
+        nonlocal missing
+        missing = _missing_links(player, manager, rig, options.recorded)
+        return not missing
+
+    # Twice: a subscription may be made between two looks.
+    connected = _wait(is_connected, options.within) and _wait(is_connected, options.within)
+    if not connected:
+        rospy.logwarn("the bag is played though not connected: %s", ", ".join(missing))
+    name = player + "/pause_playback"
+    try:
+        rospy.wait_for_service(name, options.player_within)
+        done = rospy.ServiceProxy(name, _set_bool())(False).success
+    except (rospy.ROSException, rospy.ServiceException) as error:
+        raise DataError("%s does not start: %s" % (player, error)) from error
+    if not done:
+        raise DataError("%s does not start" % player)
+
+
+def _set_bool() -> Any:
+    """std_srvs/SetBool, whose package need not be installed."""
+
+    def message(name: str, text: str) -> Any:
+        return genpy.dynamic.generate_dynamic(name, text)[name]
+
+    return type(
+        "SetBool",
+        (),
+        {
+            "_type": "std_srvs/SetBool",
+            "_md5sum": "09fb03525b03e7ea1fd3992bafd87e16",
+            "_request_class": message("std_srvs/SetBoolRequest", "bool data\n"),
+            "_response_class": message(
+                "std_srvs/SetBoolResponse", "bool success\nstring message\n"
+            ),
+        },
+    )

@@ -1,0 +1,55 @@
+#!/usr/bin/python3
+# SPDX-License-Identifier: MIT
+"""Lets the player of a replay go once every link of the chain and the recorder are connected.
+replay.launch starts it beside a player that waits."""
+
+import argparse
+import os
+import sys
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+
+from semantic_lidar_fusion import cli  # noqa: E402
+
+
+def make_parser():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rig", metavar="FILE", required=True, help="the rig file of the replay")
+    parser.add_argument(
+        "--overrides",
+        metavar="TEXT",
+        default="",
+        help="changes to the rig file, key=value, separated by blanks",
+    )
+    parser.add_argument(
+        "--manager", metavar="NODE", default="fusion_manager", help="the nodelet manager"
+    )
+    parser.add_argument("--recorded", action="store_true", help="wait for the node `recorder` too")
+    parser.add_argument(
+        "--within",
+        metavar="S",
+        type=float,
+        default=60.0,
+        help="seconds after which the bag is played anyway, with a warning (default: 60)",
+    )
+    parser.add_argument(
+        "--player-within",
+        metavar="S",
+        type=float,
+        default=30.0,
+        help="seconds until the node `player` must run (default: 30)",
+    )
+    return parser
+
+
+def main():
+    # roslaunch adds __name:=... and __log:=...
+    options = make_parser().parse_args([a for a in sys.argv[1:] if not a.startswith("__")])
+    cli.require("numpy", "yaml", "rospy", "rosgraph", "genpy")
+    from semantic_lidar_fusion.bags import replay
+
+    replay.start(options)
+
+
+if __name__ == "__main__":
+    cli.run(main)
