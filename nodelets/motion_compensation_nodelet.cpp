@@ -89,7 +89,7 @@ class MotionCompensationNodelet : public FusionNodelet {
       const StageTimer timer(health(), "decode");
       scan->cloud = lidar_->decode(*message);
     }
-    reportTimeDecision();
+    reportNotes();
     scan->interval = scanInterval(scan->cloud);
     if (scan->interval.first_ns <= 0) {  // the selection nodelet says it; it is no jump of time
       health().count("dropped: scan of stamp 0");
@@ -134,16 +134,16 @@ class MotionCompensationNodelet : public FusionNodelet {
                                 " in a scan; the rest of the scan is used");
   }
 
-  /// Tells once how the times of the points are understood.
-  void reportTimeDecision() {
-    if (lidar_->timeDecision() == told_time_decision_) return;
-    told_time_decision_ = lidar_->timeDecision();
-    if (lidar_->timeDecisionIsDoubtful()) {
-      NODELET_WARN_STREAM(rig().lidar.topic << ": " << told_time_decision_);
-    } else {
-      NODELET_INFO_STREAM(rig().lidar.topic << ": " << told_time_decision_);
+  /// Tells once how the lidar's messages are understood.
+  void reportNotes() {
+    for (const LidarDecoder::Note& note : lidar_->takeNotes()) {
+      if (note.warning) {
+        NODELET_WARN_STREAM(rig().lidar.topic << ": " << note.text);
+      } else {
+        NODELET_INFO_STREAM(rig().lidar.topic << ": " << note.text);
+      }
     }
-    health().set("point times", told_time_decision_);
+    health().set("point times", lidar_->timeDecision());
   }
 
   void onReference(const sensor_msgs::TimeReferenceConstPtr& message) {
@@ -225,7 +225,6 @@ class MotionCompensationNodelet : public FusionNodelet {
 
   std::unique_ptr<ScanPipeline> pipeline_;
   std::unique_ptr<LidarDecoder> lidar_;
-  std::string told_time_decision_;
   std::unique_ptr<TfSubscription> tf_;
   std::unique_ptr<EpochMonitor> epochs_;
   StampNs last_first_ns_ = 0;  ///< of the last scan with points

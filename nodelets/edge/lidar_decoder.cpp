@@ -16,6 +16,7 @@ PacketDecoderConfig packetConfig(const LidarConfig& lidar) {
   config.time_offset_ns = toNs(lidar.time_offset_s);
   config.min_range_m = lidar.min_range_m;
   config.max_range_m = lidar.max_range_m;
+  config.longest_scan_ns = toNs(lidar.longest_scan_s);
   config.vertical_offsets_m = lidar.vertical_offsets_m;
   return config;
 }
@@ -29,6 +30,8 @@ PointCloudReaderConfig cloudConfig(const LidarConfig& lidar) {
   config.time_offset_ns = toNs(lidar.time_offset_s);
   config.min_range_m = lidar.min_range_m;
   config.max_range_m = lidar.max_range_m;
+  config.largest_coordinate_m = lidar.largest_coordinate_m;
+  config.longest_scan_ns = toNs(lidar.longest_scan_s);
   return config;
 }
 
@@ -69,29 +72,60 @@ std::string LidarDecoder::frame(const std::string& message_frame) const {
   return frame;
 }
 
+void LidarDecoder::note(const std::string& text, bool warning) {
+  constexpr std::size_t kMost = 100;
+  if (noted_.size() < kMost && noted_.insert(text).second) notes_.push_back({text, warning});
+}
+
+/// One driver means one thing by its times: where scans are read in several ways, some are misread.
+void LidarDecoder::noteTimes(const TimeDecision& decision) {
+  time_decision_ = decision.text;
+  note(decision.text, decision.warning);
+  const bool changed =
+      last_times_ && (last_times_->field != decision.field || last_times_->unit != decision.unit ||
+                      last_times_->reference != decision.reference);
+  if (changed) {
+    note(
+        "the times of one scan are read otherwise than those of the scan before; set "
+        "lidar.time_unit and lidar.time_reference. Before: " +
+            last_times_->text,
+        true);
+  }
+  last_times_ = decision;
+}
+
+std::vector<LidarDecoder::Note> LidarDecoder::takeNotes() {
+  std::vector<Note> notes;
+  notes.swap(notes_);
+  return notes;
+}
+
 TimedCloud LidarDecoder::decode(const VelodyneScan& message) {
   DecodedScan scan = packets_.decode(packets(message), stampNs(message.header.stamp),
                                      frame(message.header.frame_id));
   const PacketCounters& counters = scan.counters;
   count_drops_("duplicate packets", counters.duplicate_packets);
   count_drops_("packets of zeros", counters.zero_packets);
+  count_drops_("packets stamped far from the others of their scan", counters.outlier_packets);
   count_drops_("bad packet blocks", counters.bad_blocks);
   count_left_out_("points out of range", counters.out_of_range_points);
   count_left_out_("second returns equal to the first", counters.equal_returns);
   for (const auto& [reason, count] : counters.unknown_packets) {
     count_drops_("packets with " + reason, count);
   }
+  if (!scan.cloud.empty()) noteTimes(scan.time);
   return std::move(scan.cloud);
 }
 
 TimedCloud LidarDecoder::decode(const sensor_msgs::PointCloud2& message) {
   ReadCloud read = clouds_.read(cloudBytes(message, frame(message.header.frame_id)));
   count_left_out_("points that are not finite", read.counters.non_finite_points);
+  count_left_out_("points without a return", read.counters.no_return_points);
   count_left_out_("points out of range", read.counters.out_of_range_points);
-  if (!read.cloud.empty()) {
-    time_decision_ = read.time.text;
-    time_decision_is_doubtful_ = read.time.warning;
-  }
+  count_drops_("points beyond lidar.largest_coordinate_m", read.counters.far_points);
+  count_drops_("points with a time that is none of their scan's", read.counters.time_outliers);
+  for (const std::string& text : read.notes) note(text, false);
+  if (!read.cloud.empty()) noteTimes(read.time);
   return std::move(read.cloud);
 }
 

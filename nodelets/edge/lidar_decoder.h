@@ -5,7 +5,10 @@
 #include <sensor_msgs/PointCloud2.h>
 
 #include <functional>
+#include <optional>
+#include <set>
 #include <string>
+#include <vector>
 
 #include "edge/velodyne_messages.h"
 #include "semantic_lidar_fusion/common/point_cloud.h"
@@ -29,20 +32,29 @@ class LidarDecoder {
   TimedCloud decode(const VelodyneScan& message);
   TimedCloud decode(const sensor_msgs::PointCloud2& message);
 
-  /// How the times of the last PointCloud2 were understood, in one line; empty for packets.
+  /// How the times of the last scan with points were understood, in one line.
   const std::string& timeDecision() const { return time_decision_; }
-  /// Whether that understanding is a guess that a user should know of.
-  bool timeDecisionIsDoubtful() const { return time_decision_is_doubtful_; }
+
+  /// How the input is understood, as far as it was not told before: each line comes once.
+  struct Note {
+    std::string text;
+    bool warning = false;  ///< a guess, or wrong
+  };
+  std::vector<Note> takeNotes();
 
  private:
   std::string frame(const std::string& message_frame) const;
+  void note(const std::string& text, bool warning);
+  void noteTimes(const TimeDecision& decision);
 
   LidarConfig config_;
   CountDrops count_drops_, count_left_out_;
   PacketDecoder packets_;
   PointCloudReader clouds_;
   std::string time_decision_;
-  bool time_decision_is_doubtful_ = false;
+  std::optional<TimeDecision> last_times_;
+  std::set<std::string> noted_;
+  std::vector<Note> notes_;  ///< that were not taken
 };
 
 }  // namespace semantic_lidar_fusion

@@ -226,29 +226,12 @@ std::vector<CameraConfig> readCameras(const YAML::Node& node, const std::string&
   return cameras;
 }
 
-void readModel(YamlSection& section, std::optional<LidarModel>* model) {
+void readModel(YamlSection& section, const LidarSpec** model) {
   std::string text = "auto";
   section.text("model", &text);
-  std::string plain;
-  for (const char c : text) {
-    if (c == '-' || c == '_' || c == ' ') continue;
-    plain += static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
-  }
-  if (plain == "vlp16" || plain == "puck" || plain == "pucklite") {
-    *model = LidarModel::kVlp16;
-  } else if (plain == "puckhires" || plain == "vlp16hires" || plain == "hires") {
-    *model = LidarModel::kPuckHiRes;
-  } else if (plain == "vlp32c") {
-    *model = LidarModel::kVlp32c;
-  } else if (plain == "hdl32e") {
-    *model = LidarModel::kHdl32e;
-  } else if (plain != "auto") {
-    section.problem("model", "must be one of auto, VLP16, PuckHiRes, VLP32C, HDL32E");
-  }
-}
-
-std::size_t laserCount(LidarModel model) {
-  return model == LidarModel::kVlp16 || model == LidarModel::kPuckHiRes ? 16 : 32;
+  if (text == "auto") return;
+  *model = findLidarSpec(text);
+  if (!*model) section.problem("model", "must be one of auto, " + lidarSpecNames());
 }
 
 LidarConfig readLidar(YamlSection section, const Problems* problems) {
@@ -261,6 +244,8 @@ LidarConfig readLidar(YamlSection section, const Problems* problems) {
   readFrame(section, "frame", false, &lidar.frame);
   section.number("min_range_m", &lidar.min_range_m, {0});
   section.number("max_range_m", &lidar.max_range_m, {0});
+  section.number("largest_coordinate_m", &lidar.largest_coordinate_m, {1, 1e9});
+  section.number("longest_scan_s", &lidar.longest_scan_s, {0.001, 60});
   if (lidar.max_range_m > 0 && lidar.max_range_m <= lidar.min_range_m) {
     section.problem("max_range_m", "must be above min_range_m, or 0 for no limit");
   }
@@ -292,9 +277,9 @@ LidarConfig readLidar(YamlSection section, const Problems* problems) {
   const std::size_t problems_before = problems->size();
   section.numbers("vertical_offsets_m", &lidar.vertical_offsets_m, {-1, 1});
   if (problems->size() == problems_before && !lidar.vertical_offsets_m.empty() && lidar.model &&
-      lidar.vertical_offsets_m.size() != laserCount(*lidar.model)) {
+      lidar.vertical_offsets_m.size() != static_cast<std::size_t>(lidar.model->laserCount())) {
     section.problem("vertical_offsets_m", "must be empty or hold one number for each of the " +
-                                              std::to_string(laserCount(*lidar.model)) +
+                                              std::to_string(lidar.model->laserCount()) +
                                               " lasers of the model, lowest first");
   }
   section.finish();

@@ -5,12 +5,14 @@
 #include <array>
 #include <cmath>
 #include <cstdio>
-#include <cstring>
+#include <deque>
+#include <optional>
 #include <utility>
 
+#include "packet_times.h"
 #include "range_limits.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "semantic_lidar_fusion/lidar/firing_times.h"
+#include "semantic_lidar_fusion/lidar/lidar_spec.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -29,21 +31,6 @@ std::string hex(std::uint8_t byte) {
   char text[5];
   std::snprintf(text, sizeof(text), "0x%02X", static_cast<unsigned>(byte));
   return text;
-}
-
-std::optional<LidarModel> modelOf(std::uint8_t factory_byte) {
-  switch (factory_byte) {
-    case 0x22:
-      return LidarModel::kVlp16;
-    case 0x24:
-      return LidarModel::kPuckHiRes;
-    case 0x28:
-      return LidarModel::kVlp32c;
-    case 0x21:
-      return LidarModel::kHdl32e;
-    default:
-      return std::nullopt;
-  }
 }
 
 struct CosSin {
@@ -76,36 +63,282 @@ struct LaserTable {
 };
 
 struct ModelTable {
-  const FiringTimes* times = nullptr;
-  std::array<LaserTable, 32> lasers{};
+  const LidarSpec* spec = nullptr;
+  std::vector<LaserTable> lasers;
 };
 
-ModelTable makeTable(LidarModel model, const std::vector<double>& vertical_offsets_m) {
+ModelTable makeTable(const LidarSpec& spec, const std::vector<double>& vertical_offsets_m) {
   ModelTable table;
-  table.times = &firingTimes(model);
-  for (int i = 0; i < table.times->laser_count; ++i) {
-    const Laser& laser = table.times->lasers[i];
-    table.lasers[i] = {std::cos(laser.elevation_rad),
-                       std::sin(laser.elevation_rad),
-                       cosSin(laser.azimuth_offset_rad),
-                       vertical_offsets_m.empty() ? 0.0 : vertical_offsets_m[laser.ring],
-                       laser.time_ns,
-                       laser.ring};
+  table.spec = &spec;
+  for (const Laser& laser : spec.lasers) {
+    table.lasers.push_back({std::cos(laser.elevation_rad), std::sin(laser.elevation_rad),
+                            cosSin(laser.azimuth_offset_rad),
+                            vertical_offsets_m.empty() ? 0.0 : vertical_offsets_m[laser.ring],
+                            laser.time_ns, laser.ring});
   }
   return table;
 }
 
-/// Blocks that tell one and the same firings: one block, or two in dual return mode.
+unsigned flagOf(const Packet& packet, int block) {
+  return littleEndian16(packet.data.data() + block * kBlockBytes);
+}
+
+int azimuthOf(const Packet& packet, int block) {
+  return static_cast<int>(littleEndian16(packet.data.data() + block * kBlockBytes + 2));
+}
+
+/// HDL-64E: lasers 0 to 31 and 32 to 63 in blocks of two flags by turns, and status bytes where
+/// others tell their model.
+bool looksLikeHdl64e(const Packet& packet) {
+  for (int b = 0; b < kBlocksPerPacket; ++b) {
+    if (flagOf(packet, b) != (b % 2 == 0 ? 0xEEFFu : 0xDDFFu)) return false;
+  }
+  return true;
+}
+
+/// The return mode by the blocks: in dual return mode two follow each other with one flag and one
+/// azimuth. Of a sensor that stands still all azimuths are equal, which tells nothing.
+bool looksDual(const Packet& packet, const LidarSpec& spec) {
+  bool turns = spec.bankCount() > 1;
+  const int blocks = spec.slotsPerPacket(true) * spec.blocksPerSlot(true);
+  for (int b = 0; b + 1 < blocks; b += 2) {
+    if (flagOf(packet, b) != flagOf(packet, b + 1)) return false;
+    if (azimuthOf(packet, b) != azimuthOf(packet, b + 1)) return false;
+    turns = turns || azimuthOf(packet, b) != azimuthOf(packet, 0);
+  }
+  return turns;
+}
+
+/// One azimuth and the firings that belong to it; see LidarSpec.
 struct Slot {
   bool valid = false;
   int azimuth = 0;           ///< 0.01 deg, at the begin of the first firing
   double rate_per_ns = 0.0;  ///< rad
+  StampNs gap_ns = 0;        ///< that the sensor turned on without a word, before it
+};
+
+/// A packet that can be decoded.
+struct KnownPacket {
+  const Packet* packet = nullptr;
+  const ModelTable* table = nullptr;
+  bool dual = false;
+  StampNs stamp = 0;  ///< true time
+  std::array<bool, kBlocksPerPacket> good{};
+  std::array<int, kBlocksPerPacket> bank{};
+  std::array<Slot, kBlocksPerPacket> slots{};
+  StampNs gap_ns = 0;  ///< of all slots
+
+  const LidarSpec& spec() const { return *table->spec; }
+  int slotCount() const { return spec().slotsPerPacket(dual); }
+};
+
+/// Model and return mode of each packet.
+class PacketKinds {
+ public:
+  PacketKinds(const PacketDecoderConfig& config, PacketCounters& counters)
+      : config_(config), counters_(counters) {}
+
+  /// Sets `table` and `dual`; false, counted with the reason, for packets of unknown kind.
+  bool find(KnownPacket& known) {
+    const Packet& packet = *known.packet;
+    const std::uint8_t mode = packet.data[kModeOffset];
+    const std::uint8_t factory = packet.data[kFactoryOffset];
+    const LidarSpec* const spec = config_.model ? config_.model : findLidarSpec(factory);
+    if (!spec && looksLikeHdl64e(packet)) {
+      return refuse(
+          "the blocks of an HDL-64E, whose angles are those of a single sensor and stand in no "
+          "public table; use the cloud of its driver (lidar.input: points)");
+    }
+    if (!spec) {
+      return refuse("factory byte " + hex(factory) + " is none of " + factoryBytes() +
+                    "; set lidar.model");
+    }
+    const bool mode_is_known = mode == 0x37 || mode == 0x38 || mode == 0x39;
+    if (!mode_is_known && !config_.model) {
+      return refuse("return mode byte " + hex(mode) +
+                    " is none of 0x37 strongest, 0x38 last, 0x39 dual; set lidar.model, then the "
+                    "blocks tell the mode");
+    }
+    const std::size_t offsets = config_.vertical_offsets_m.size();
+    if (offsets != 0 && offsets != static_cast<std::size_t>(spec->laserCount())) {
+      return refuse("vertical_offsets_m has " + std::to_string(offsets) +
+                    " entries, factory byte " + hex(factory) + " means " +
+                    std::to_string(spec->laserCount()) + " lasers");
+    }
+    known.dual = mode_is_known ? mode == 0x39 : looksDual(packet, *spec);
+    known.table = &tableOf(*spec);
+    return true;
+  }
+
+ private:
+  const ModelTable& tableOf(const LidarSpec& spec) {
+    for (const ModelTable& table : tables_) {
+      if (table.spec == &spec) return table;
+    }
+    tables_.push_back(makeTable(spec, config_.vertical_offsets_m));
+    return tables_.back();
+  }
+
+  bool refuse(const std::string& reason) {
+    ++counters_.unknown_packets[reason];
+    return false;
+  }
+
+  static std::string factoryBytes() {
+    std::string bytes;
+    for (const LidarSpec& spec : lidarSpecs()) {
+      bytes += (bytes.empty() ? "" : ", ") + hex(spec.factory_byte) + " " + spec.name;
+    }
+    return bytes;
+  }
+
+  const PacketDecoderConfig& config_;
+  PacketCounters& counters_;
+  std::deque<ModelTable> tables_;  ///< of the models that were met; they stay where they are
 };
 
 /// Signed difference of two azimuths, the shorter way round.
 int azimuthStep(int from, int to) {
   return (to - from + kFullTurn + kFullTurn / 2) % kFullTurn - kFullTurn / 2;
 }
+
+/// Finds the bank and the azimuth of each block.
+void readBlocks(KnownPacket& known, PacketCounters& counters) {
+  const std::vector<std::uint16_t>& flags = known.spec().bank_flags;
+  const int blocks_per_slot = known.spec().blocksPerSlot(known.dual);
+  for (int b = 0; b < known.slotCount() * blocks_per_slot; ++b) {
+    const auto flag = std::find(flags.begin(), flags.end(), flagOf(*known.packet, b));
+    const int azimuth = azimuthOf(*known.packet, b);
+    if (flag == flags.end() || azimuth >= kFullTurn) {
+      ++counters.bad_blocks;
+      continue;
+    }
+    known.good[b] = true;
+    known.bank[b] = static_cast<int>(flag - flags.begin());
+    Slot& slot = known.slots[b / blocks_per_slot];
+    if (slot.valid) continue;
+    slot.valid = true;
+    slot.azimuth = azimuth;
+  }
+}
+
+/// How fast the sensor turns, slot by slot. A motor keeps its rate from one slot to the next: a
+/// step that says otherwise leads across a part of the turn that the sensor leaves out (a reduced
+/// field of view), where it goes on turning without sending.
+class TurnRates {
+ public:
+  explicit TurnRates(std::vector<KnownPacket>& packets) : packets_(packets) {
+    std::vector<double> rates;
+    for (std::size_t p = 0; p < packets.size(); ++p) {
+      forEachStep(p, [&](int from, int to) { rates.push_back(rateOf(packets[p], from, to)); });
+      if (const auto rate = rateToNext(p)) rates.push_back(*rate);
+    }
+    rates.erase(std::remove_if(rates.begin(), rates.end(),
+                               [](double rate) { return std::abs(rate) > kFastestPerNs; }),
+                rates.end());
+    if (rates.empty()) return;
+    const auto middle = rates.begin() + static_cast<std::ptrdiff_t>((rates.size() - 1) / 2);
+    std::nth_element(rates.begin(), middle, rates.end());
+    usual_per_ns_ = *middle;
+  }
+
+  /// Rates from each valid slot to the next; the last takes the previous one, also that of an
+  /// earlier packet.
+  void fill() {
+    double rate_per_ns = usual_per_ns_;
+    for (std::size_t p = 0; p < packets_.size(); ++p) {
+      KnownPacket& known = packets_[p];
+      int last = -1;
+      StampNs gap_ns = 0;
+      forEachStep(p, [&](int from, int to) {
+        const double rate = rateOf(known, from, to);
+        if (isPlausible(rate, known)) {
+          rate_per_ns = rate;
+        } else {
+          gap_ns += gapOf(known, from, to);
+        }
+        known.slots[from].rate_per_ns = rate_per_ns;
+        known.slots[to].gap_ns = gap_ns;
+        last = to;
+      });
+      const auto to_next = rateToNext(p);
+      if (to_next && isPlausible(*to_next, known)) rate_per_ns = *to_next;
+      for (int s = std::max(last, 0); s < known.slotCount(); ++s) {
+        known.slots[s].rate_per_ns = rate_per_ns;
+      }
+      settleGap(p, gap_ns);
+    }
+  }
+
+ private:
+  /// No spinning lidar turns faster than 30 times a second.
+  static constexpr double kFastestPerNs = 30.0 * 2.0 * kPi * 1e-9;
+  /// Steps may differ by the rounding of two azimuths and as much again, 0.01 deg.
+  static constexpr double kRounding = 3.0;
+
+  template <typename Use>
+  void forEachStep(std::size_t p, const Use& use) const {
+    const KnownPacket& known = packets_[p];
+    int from = -1;
+    for (int s = 0; s < known.slotCount(); ++s) {
+      if (!known.slots[s].valid) continue;
+      if (from >= 0) use(from, s);
+      from = s;
+    }
+  }
+
+  static double rateOf(const KnownPacket& known, int from, int to) {
+    return azimuthStep(known.slots[from].azimuth, known.slots[to].azimuth) * kRadPerUnit /
+           static_cast<double>((to - from) * known.spec().slotNs());
+  }
+
+  /// From the only slot of a packet to that of the next, if no packet is lost between them.
+  std::optional<double> rateToNext(std::size_t p) const {
+    if (packets_[p].slotCount() > 1 || p + 1 == packets_.size()) return std::nullopt;
+    const KnownPacket& a = packets_[p];
+    const KnownPacket& b = packets_[p + 1];
+    const StampNs packet_ns = a.spec().packetNs(a.dual);
+    if (!a.slots[0].valid || !b.slots[0].valid || b.stamp - a.stamp > packet_ns * 3 / 2) {
+      return std::nullopt;
+    }
+    return azimuthStep(a.slots[0].azimuth, b.slots[0].azimuth) * kRadPerUnit /
+           static_cast<double>(packet_ns);
+  }
+
+  bool isPlausible(double rate, const KnownPacket& known) const {
+    return std::abs(rate - usual_per_ns_) <=
+           0.5 * std::abs(usual_per_ns_) +
+               kRounding * kRadPerUnit / static_cast<double>(known.spec().slotNs());
+  }
+
+  /// How long the sensor turned from one slot to the next beyond what the slots themselves take.
+  StampNs gapOf(const KnownPacket& known, int from, int to) const {
+    if (usual_per_ns_ <= 0.0) return 0;
+    const int turn = (known.slots[to].azimuth - known.slots[from].azimuth + kFullTurn) % kFullTurn;
+    const StampNs turned_ns = std::llround(turn * kRadPerUnit / usual_per_ns_);
+    return std::max<StampNs>(turned_ns - (to - from) * known.spec().slotNs(), 0);
+  }
+
+  /// Damaged azimuths look like gaps too: those of a packet add up to less than a turn, and end
+  /// before the next packet begins.
+  void settleGap(std::size_t p, StampNs gap_ns) {
+    if (gap_ns == 0) return;
+    KnownPacket& known = packets_[p];
+    const StampNs packet_ns = known.spec().packetNs(known.dual);
+    const bool less_than_a_turn =
+        static_cast<double>(gap_ns + packet_ns / 2) * usual_per_ns_ < kFullTurn * kRadPerUnit;
+    const bool fits =
+        p + 1 == packets_.size() || packets_[p + 1].stamp - known.stamp > gap_ns + packet_ns / 2;
+    if (less_than_a_turn && fits) {
+      known.gap_ns = gap_ns;
+    } else {
+      for (Slot& slot : known.slots) slot.gap_ns = 0;
+    }
+  }
+
+  std::vector<KnownPacket>& packets_;
+  double usual_per_ns_ = 0.0;
+};
 
 /// Decodes the packets of one scan, in order, to the end of a cloud.
 class ScanWriter {
@@ -116,29 +349,33 @@ class ScanWriter {
     cloud_.firings.reserve(packet_count * kBlocksPerPacket * 2);
   }
 
-  void write(const Packet& packet, std::uint32_t packet_index) {
-    const std::uint8_t mode = packet.data[kModeOffset];
-    const std::uint8_t factory = packet.data[kFactoryOffset];
-    const std::optional<LidarModel> model = config_.model ? config_.model : modelOf(factory);
-    if (!model) {
-      ++counters_.unknown_packets["factory byte " + hex(factory) +
-                                  " is none of 0x21, 0x22, 0x24, 0x28; set lidar.model"];
-      return;
+  void write(const KnownPacket& known, std::uint32_t packet_index) {
+    const LidarSpec& spec = known.spec();
+    const int blocks_per_slot = spec.blocksPerSlot(known.dual);
+    const StampNs start = startOf(known);
+    for (int s = 0; s < known.slotCount(); ++s) {
+      const Slot& slot = known.slots[s];
+      if (!slot.valid) continue;
+      slot_azimuth_ = cosSin(slot.azimuth * kRadPerUnit);
+      rate_per_ns_ = slot.rate_per_ns;
+      slot_start_ = start + s * spec.slotNs() + slot.gap_ns;
+      packet_index_ = packet_index;
+      firing_index_.fill(-1);
+      std::array<const std::uint8_t*, kMostBanks> first_returns{};
+      for (int b = s * blocks_per_slot; b < (s + 1) * blocks_per_slot; ++b) {
+        if (!known.good[b]) continue;
+        const std::uint8_t* const returns = known.packet->data.data() + b * kBlockBytes + 4;
+        const std::uint8_t*& first = first_returns[known.bank[b]];
+        for (int first_in_block = 0; first_in_block < kReturnsPerBlock;
+             first_in_block += std::min(spec.laserCount(), kReturnsPerBlock)) {
+          const int in_slot = known.bank[b] * kReturnsPerBlock + first_in_block;
+          const std::size_t offset = first_in_block * kReturnBytes;
+          writeFiring(returns + offset, first ? first + offset : nullptr, *known.table,
+                      in_slot / spec.laserCount(), in_slot % spec.laserCount());
+        }
+        first = returns;
+      }
     }
-    if (mode != 0x37 && mode != 0x38 && mode != 0x39) {
-      ++counters_.unknown_packets["return mode byte " + hex(mode) +
-                                  " is none of 0x37 strongest, 0x38 last, 0x39 dual"];
-      return;
-    }
-    const ModelTable* const table = tableOf(*model);
-    if (!table) {
-      ++counters_.unknown_packets["vertical_offsets_m has " +
-                                  std::to_string(config_.vertical_offsets_m.size()) +
-                                  " entries, factory byte " + hex(factory) + " means " +
-                                  std::to_string(firingTimes(*model).laser_count) + " lasers"];
-      return;
-    }
-    writeKnown(packet, packet_index, *table, mode == 0x39);
   }
 
   void finish() { resizeCloud(size_); }
@@ -154,101 +391,27 @@ class ScanWriter {
     cloud_.firing.resize(size);
   }
 
-  /// Null if the configured vertical offsets do not fit the model.
-  const ModelTable* tableOf(LidarModel model) {
-    ModelTable& table = tables_[static_cast<std::size_t>(model)];
-    if (!table.times) {
-      const std::size_t offsets = config_.vertical_offsets_m.size();
-      if (offsets != 0 && offsets != static_cast<std::size_t>(firingTimes(model).laser_count)) {
-        return nullptr;
-      }
-      table = makeTable(model, config_.vertical_offsets_m);
-    }
-    return &table;
-  }
-
-  StampNs startOf(const Packet& packet, const FiringTimes& times, bool dual) const {
-    const StampNs stamp = packet.stamp + config_.time_offset_ns;
+  StampNs startOf(const KnownPacket& known) const {
+    const StampNs packet_ns = known.spec().packetNs(known.dual) + known.gap_ns;
     switch (config_.packet_stamp) {
       case PacketStamp::kMiddle:
-        return stamp - times.packetNs(dual) / 2;
+        return known.stamp - packet_ns / 2;
       case PacketStamp::kEnd:
-        return stamp - times.packetNs(dual);
+        return known.stamp - packet_ns;
       case PacketStamp::kStart:
         break;
     }
-    return stamp;
+    return known.stamp;
   }
 
-  bool checkBlock(const std::uint8_t* block) {
-    const bool good = block[0] == 0xFF && block[1] == 0xEE && littleEndian16(block + 2) < kFullTurn;
-    if (!good) ++counters_.bad_blocks;
-    return good;
-  }
-
-  /// Rates from each valid slot to the next; the last takes the previous one, also that of an
-  /// earlier packet.
-  void fillRates(std::array<Slot, kBlocksPerPacket>& slots, int slot_count, StampNs slot_ns) {
-    int from = -1;
-    for (int i = 0; i < slot_count; ++i) {
-      if (!slots[i].valid) continue;
-      if (from >= 0) {
-        rate_per_ns_ = azimuthStep(slots[from].azimuth, slots[i].azimuth) * kRadPerUnit /
-                       static_cast<double>((i - from) * slot_ns);
-        slots[from].rate_per_ns = rate_per_ns_;
-      }
-      from = i;
-    }
-    if (from >= 0) slots[from].rate_per_ns = rate_per_ns_;
-  }
-
-  void writeKnown(const Packet& packet, std::uint32_t packet_index, const ModelTable& table,
-                  bool dual) {
-    const FiringTimes& times = *table.times;
-    const StampNs start = startOf(packet, times, dual);
-    const int blocks_per_slot = dual ? 2 : 1;
-    const int slot_count = kBlocksPerPacket / blocks_per_slot;
-
-    std::array<bool, kBlocksPerPacket> good{};
-    std::array<Slot, kBlocksPerPacket> slots{};
-    for (int b = 0; b < kBlocksPerPacket; ++b) {
-      const std::uint8_t* const block = packet.data.data() + b * kBlockBytes;
-      good[b] = checkBlock(block);
-      Slot& slot = slots[b / blocks_per_slot];
-      if (good[b] && !slot.valid) {
-        slot.valid = true;
-        slot.azimuth = static_cast<int>(littleEndian16(block + 2));
-      }
-    }
-    fillRates(slots, slot_count, times.blockNs());
-
-    for (int s = 0; s < slot_count; ++s) {
-      if (!slots[s].valid) continue;
-      const CosSin slot_azimuth = cosSin(slots[s].azimuth * kRadPerUnit);
-      const StampNs slot_start = start + s * times.blockNs();
-      // The firings of this slot: -1 until one has a point.
-      std::array<std::int64_t, 2> firing_index{{-1, -1}};
-      const std::uint8_t* first_returns = nullptr;
-      for (int b = s * blocks_per_slot; b < (s + 1) * blocks_per_slot; ++b) {
-        if (!good[b]) continue;
-        const std::uint8_t* const returns = packet.data.data() + b * kBlockBytes + 4;
-        for (int f = 0; f < times.firings_per_block; ++f) {
-          const std::size_t offset = f * times.laser_count * kReturnBytes;
-          writeFiring(returns + offset, first_returns ? first_returns + offset : nullptr, table,
-                      slot_azimuth, slots[s].rate_per_ns, f * times.firing_ns, slot_start,
-                      packet_index, firing_index[f]);
-        }
-        first_returns = returns;
-      }
-    }
-  }
-
+  /// The returns of one firing in one block, from laser `first_laser` on.
   void writeFiring(const std::uint8_t* returns, const std::uint8_t* first_returns,
-                   const ModelTable& table, const CosSin& slot_azimuth, double rate_per_ns,
-                   StampNs firing_ns, StampNs slot_start, std::uint32_t packet_index,
-                   std::int64_t& firing_index) {
-    const double unit = table.times->distance_unit_m;
-    for (int l = 0; l < table.times->laser_count; ++l) {
+                   const ModelTable& table, int firing, int first_laser) {
+    const double unit = table.spec->distance_unit_m;
+    const StampNs firing_ns = firing * table.spec->firing_ns;
+    std::int64_t& firing_index = firing_index_[firing];
+    const int count = std::min(table.spec->laserCount(), kReturnsPerBlock);
+    for (int l = 0; l < count; ++l) {
       const std::uint8_t* const data = returns + l * kReturnBytes;
       const unsigned raw_distance = littleEndian16(data);
       if (raw_distance == 0) continue;
@@ -262,13 +425,13 @@ class ScanWriter {
         ++counters_.out_of_range_points;
         continue;
       }
-      const LaserTable& laser = table.lasers[l];
+      const LaserTable& laser = table.lasers[first_laser + l];
       const StampNs in_slot = firing_ns + laser.time_ns;
       const CosSin azimuth =
-          sum(sum(slot_azimuth, cosSinSmall(rate_per_ns * static_cast<double>(in_slot))),
+          sum(sum(slot_azimuth_, cosSinSmall(rate_per_ns_ * static_cast<double>(in_slot))),
               laser.azimuth_offset);
       const double horizontal = distance * laser.cos_elevation;
-      const StampNs time = slot_start + in_slot;
+      const StampNs time = slot_start_ + in_slot;
       cloud_.x[size_] = static_cast<float>(horizontal * azimuth.cos);
       cloud_.y[size_] = static_cast<float>(-horizontal * azimuth.sin);
       cloud_.z[size_] =
@@ -278,11 +441,11 @@ class ScanWriter {
       cloud_.time_ns[size_] = time;
       if (firing_index < 0) {
         firing_index = static_cast<std::int64_t>(cloud_.firings.size());
-        cloud_.firings.push_back({time, time, packet_index});
+        cloud_.firings.push_back({time, time, packet_index_});
       }
-      Firing& firing = cloud_.firings[static_cast<std::size_t>(firing_index)];
-      firing.begin_ns = std::min(firing.begin_ns, time);
-      firing.end_ns = std::max(firing.end_ns, time);
+      Firing& entry = cloud_.firings[static_cast<std::size_t>(firing_index)];
+      entry.begin_ns = std::min(entry.begin_ns, time);
+      entry.end_ns = std::max(entry.end_ns, time);
       cloud_.firing[size_] = static_cast<std::uint32_t>(firing_index);
       ++size_;
     }
@@ -291,8 +454,12 @@ class ScanWriter {
   const PacketDecoderConfig& config_;
   TimedCloud& cloud_;
   PacketCounters& counters_;
-  std::array<ModelTable, 4> tables_{};
+  // Of the slot that is being written.
+  CosSin slot_azimuth_;
   double rate_per_ns_ = 0.0;
+  StampNs slot_start_ = 0;
+  std::uint32_t packet_index_ = 0;
+  std::array<std::int64_t, kReturnsPerBlock> firing_index_{};  ///< -1 until a firing has a point
   std::size_t size_ = 0;
 };
 
@@ -333,16 +500,16 @@ PacketDecoder::PacketDecoder(PacketDecoderConfig config) : config_(std::move(con
   std::vector<std::string> problems;
   checkRangeLimits(config_.min_range_m, config_.max_range_m, problems);
   const std::size_t offsets = config_.vertical_offsets_m.size();
-  if (config_.model) {
-    const FiringTimes& times = firingTimes(*config_.model);
-    if (offsets != 0 && offsets != static_cast<std::size_t>(times.laser_count)) {
-      problems.push_back("lidar.vertical_offsets_m has " + std::to_string(offsets) +
-                         " entries, must have one for each of the " +
-                         std::to_string(times.laser_count) + " rings of the " + times.model_name);
-    }
-  } else if (offsets != 0 && offsets != 16 && offsets != 32) {
+  if (config_.longest_scan_ns <= 0) {
+    problems.push_back("lidar.longest_scan_s is " + std::to_string(config_.longest_scan_ns) +
+                       " ns, must be more than 0");
+  }
+  if (config_.model && offsets != 0 &&
+      offsets != static_cast<std::size_t>(config_.model->laserCount())) {
     problems.push_back("lidar.vertical_offsets_m has " + std::to_string(offsets) +
-                       " entries, must have 16 or 32, one for each ring");
+                       " entries, must have one for each of the " +
+                       std::to_string(config_.model->laserCount()) + " rings of the " +
+                       config_.model->name);
   }
   for (const double offset : config_.vertical_offsets_m) {
     if (!std::isfinite(offset)) {
@@ -359,10 +526,25 @@ DecodedScan PacketDecoder::decode(const std::vector<Packet>& packets, StampNs he
   scan.cloud.header_stamp = header_stamp;
   scan.cloud.frame_id = frame_id;
   scan.counters.packets = packets.size();
-  const std::vector<const Packet*> kept = cleaned(packets, scan.counters);
-  ScanWriter writer(config_, kept.size(), scan);
-  for (std::size_t i = 0; i < kept.size(); ++i) {
-    writer.write(*kept[i], static_cast<std::uint32_t>(i));
+  PacketTimes times = packetTimes(cleaned(packets, scan.counters), config_.longest_scan_ns);
+  scan.counters.outlier_packets = times.outliers;
+  scan.time = std::move(times.decision);
+
+  std::vector<KnownPacket> known;
+  known.reserve(times.packets.size());
+  PacketKinds kinds(config_, scan.counters);
+  for (const StampedPacket& stamped : times.packets) {
+    KnownPacket packet;
+    packet.packet = stamped.packet;
+    packet.stamp = stamped.stamp + config_.time_offset_ns;
+    if (!kinds.find(packet)) continue;
+    readBlocks(packet, scan.counters);
+    known.push_back(packet);
+  }
+  TurnRates(known).fill();
+  ScanWriter writer(config_, known.size(), scan);
+  for (std::size_t i = 0; i < known.size(); ++i) {
+    writer.write(known[i], static_cast<std::uint32_t>(i));
   }
   writer.finish();
   return scan;

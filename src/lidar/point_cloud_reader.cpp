@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdio>
 #include <cstring>
 #include <limits>
 #include <utility>
@@ -15,15 +16,33 @@ namespace semantic_lidar_fusion {
 namespace {
 
 constexpr StampNs kDayNs = 86400 * kNsPerSecond;
-/// No scan is longer; relative times beyond it belong to another clock.
+/// Relative times beyond it belong to another clock.
 constexpr StampNs kLongestOffsetNs = 60 * kNsPerSecond;
 /// Times that no sensor means, and that would not fit 64 bits in ns with a stamp added.
 constexpr double kLargestNs = 4e18;
+/// Stands for them.
+constexpr StampNs kNoClockNs = 4100000000000000000;
 /// Below it a 64-bit float is the image of an integer.
 constexpr double kIntegerImage = 1e-100;
 
-const char* const kTimeNames[] = {"t", "time", "timestamp", "time_stamp", "offset_time"};
-const char* const kRingNames[] = {"ring", "channel", "line"};
+/// A shorter scan is none of a spinning lidar; its unit is wrong.
+constexpr StampNs kShortestNs = 1000000;
+/// Clouds of fewer points may be parts of a scan, or short for other reasons.
+constexpr std::size_t kManyPoints = 500;
+/// Decisions look at the middle part of the values, so that this share may be wrong on each side.
+constexpr double kTail = 0.1;
+/// Values that stand for all others in decisions.
+constexpr std::size_t kSample = 4096;
+/// Times farther than this from all others, a turn at 10 Hz, are wrong if they are few.
+constexpr StampNs kLoneNs = 100000000;
+constexpr double kFew = 0.05;
+
+// What drivers call them, the usual name first.
+const std::vector<std::string> kTimeNames = {
+    "t", "time", "timestamp", "time_stamp", "offset_time", "time_offset", "timestamps"};
+const std::vector<std::string> kRingNames = {"ring",  "channel",  "line",
+                                             "layer", "laser_id", "laser_number"};
+const std::vector<std::string> kIntensityNames = {"intensity", "i", "reflectivity", "intensities"};
 
 enum DataType : std::uint8_t {
   kInt8 = 1,
@@ -118,20 +137,42 @@ struct Field {
 
 [[noreturn]] void refuse(const std::string& what) { throw DataError("point cloud: " + what); }
 
-/// Everything that must hold before a point's bytes may be read.
-void checkLayout(const PointCloudBytes& bytes) {
+/// Everything that must hold before a point's bytes may be read. Returns the bytes from one row to
+/// the next: row_step, or, where that cannot be (some drivers leave it 0 or tell the whole cloud's
+/// bytes), the rows' own where the data are exactly they.
+std::uint64_t checkLayout(const PointCloudBytes& bytes) {
   const std::uint64_t used_row = std::uint64_t{bytes.width} * bytes.point_step;
-  const std::uint64_t all_rows = std::uint64_t{bytes.row_step} * bytes.height;
   if (bytes.is_bigendian) refuse("is_bigendian is true, only little-endian data can be read");
+  if (!bytes.data) refuse("data is missing");
+  if (bytes.row_step >= used_row && std::uint64_t{bytes.row_step} * bytes.height == bytes.size) {
+    return bytes.row_step;
+  }
+  if (used_row <= std::numeric_limits<std::uint64_t>::max() / bytes.height &&
+      used_row * bytes.height == bytes.size) {
+    return used_row;
+  }
   if (bytes.row_step < used_row) {
     refuse("row_step is " + std::to_string(bytes.row_step) + ", must be at least width " +
            std::to_string(bytes.width) + " x point_step " + std::to_string(bytes.point_step));
   }
-  if (all_rows != bytes.size) {
-    refuse("data has " + std::to_string(bytes.size) + " bytes, must have row_step " +
-           std::to_string(bytes.row_step) + " x height " + std::to_string(bytes.height));
+  refuse("data has " + std::to_string(bytes.size) + " bytes, must have row_step " +
+         std::to_string(bytes.row_step) + " x height " + std::to_string(bytes.height));
+}
+
+/// "x, y, z", for messages.
+std::string fieldNames(const PointCloudBytes& bytes) {
+  constexpr std::size_t kMost = 40;
+  std::string names;
+  for (std::size_t i = 0; i < std::min(bytes.fields.size(), kMost); ++i) {
+    names += (names.empty() ? "" : ", ") + bytes.fields[i].name;
   }
-  if (!bytes.data) refuse("data is missing");
+  return names + (bytes.fields.size() > kMost ? ", ..." : "");
+}
+
+std::string listed(const std::vector<std::string>& names) {
+  std::string text;
+  for (const std::string& name : names) text += (text.empty() ? "" : ", ") + name;
+  return text;
 }
 
 /// The field of a name; empty datatype 0 if there is none. Throws if it lies outside the point.
@@ -163,23 +204,21 @@ Field findCoordinate(const PointCloudBytes& bytes, const std::string& name) {
   return field;
 }
 
-/// A field name that stands for the time field, datatype 0 if there is none.
-Field findTime(const PointCloudBytes& bytes, const std::string& configured) {
+/// The first of several names that there is; empty datatype 0 if there is none.
+Field findField(const PointCloudBytes& bytes, const std::vector<std::string>& names) {
   Field field;
-  if (!configured.empty()) {
-    field = findField(bytes, configured);
-    if (field.datatype == 0) {
-      std::string names;
-      for (const PointFieldBytes& other : bytes.fields) {
-        names += (names.empty() ? "" : ", ") + other.name;
-      }
-      refuse("has no field '" + configured + "' (lidar.time_field); its fields are " + names);
-    }
-  } else {
-    for (const char* const name : kTimeNames) {
-      field = findField(bytes, name);
-      if (field.datatype != 0) break;
-    }
+  for (const std::string& name : names) {
+    if (field.datatype == 0) field = findField(bytes, name);
+  }
+  return field;
+}
+
+/// The time field, datatype 0 if there is none.
+Field findTime(const PointCloudBytes& bytes, const std::string& configured) {
+  Field field = configured.empty() ? findField(bytes, kTimeNames) : findField(bytes, configured);
+  if (field.datatype == 0 && !configured.empty()) {
+    refuse("has no field '" + configured + "' (lidar.time_field); its fields are " +
+           fieldNames(bytes));
   }
   if (field.datatype == kUint32 && field.count == 2) field.datatype = kUint64;
   return field;
@@ -223,14 +262,49 @@ struct RawTimes {
   std::size_t size() const { return integer ? integers.size() : floats.size(); }
 };
 
-/// Whether the values of a float64 field are integers by their bits.
+/// Whether the values of a float64 field, but for a few, are integers by their bits.
 bool areIntegerImages(const RawTimes& raw) {
-  bool any = false;
+  std::size_t numbers = 0, images = 0;
   for (const double value : raw.floats) {
-    if (std::abs(value) >= kIntegerImage) return false;
-    any = any || value != 0.0;
+    numbers += std::abs(value) >= kIntegerImage ? 1 : 0;
+    images += value != 0.0 && std::abs(value) < kIntegerImage ? 1 : 0;
   }
-  return any;
+  return static_cast<double>(images) * kFew > static_cast<double>(numbers);
+}
+
+/// Index k of `count` that are spread over n values, in no step that rows could share.
+std::size_t spread(std::size_t k, std::size_t n) { return k * 2654435761U % n; }
+
+/// Where values lie, whatever a few of them say.
+struct Bulk {
+  double middle = 0.0;  ///< half of them are less
+  /// The first and the last one that lies no farther from the inner ones than those from each
+  /// other.
+  double first = 0.0, last = 0.0;
+  double span() const { return last - first; }
+};
+
+/// The inner values are all but kTail of them on each side.
+template <typename ValueAt>
+Bulk bulkOf(std::size_t size, const ValueAt& value_at) {
+  std::vector<double> values(std::min(size, kSample));
+  for (std::size_t k = 0; k < values.size(); ++k) {
+    values[k] = value_at(size <= kSample ? k : spread(k, size));
+  }
+  const auto at = [&](double share) {
+    const auto place = values.begin() + std::lround(share * static_cast<double>(values.size() - 1));
+    std::nth_element(values.begin(), place, values.end());
+    return *place;
+  };
+  const double low = at(kTail), high = at(1.0 - kTail);
+  Bulk bulk{at(0.5), low, high};
+  for (std::size_t i = 0; i < size; ++i) {
+    const double value = value_at(i);
+    if (value < low - (high - low) || value > high + (high - low)) continue;
+    bulk.first = std::min(bulk.first, value);
+    bulk.last = std::max(bulk.last, value);
+  }
+  return bulk;
 }
 
 /// value * unit in ns, keeping the fraction of large values of seconds.
@@ -259,14 +333,42 @@ const char* nameOf(TimeReference reference) {
   }
 }
 
+/// One significant digit.
+std::string rounded(double value) {
+  char text[32];
+  std::snprintf(text, sizeof(text), "%.1g", value);
+  return text;
+}
+
+/// Warns of a scan that is shorter or longer than scans are, with the unit in which it is not.
+void judgeSpan(double span, StampNs longest_scan_ns, TimeDecision* decision) {
+  const auto ns = [&](TimeUnit unit) { return span * static_cast<double>(nsOf(unit)); };
+  const auto longest = static_cast<double>(longest_scan_ns);
+  const bool is_short = ns(decision->unit) < static_cast<double>(kShortestNs);
+  const bool is_long = ns(decision->unit) > longest;
+  if (!is_short && !is_long) return;
+  std::string cure;
+  for (const TimeUnit unit : {TimeUnit::kSeconds, TimeUnit::kMilliseconds, TimeUnit::kMicroseconds,
+                              TimeUnit::kNanoseconds}) {
+    if (cure.empty() && ns(unit) >= 5.0 * kShortestNs && ns(unit) <= longest) {
+      cure = "; in " + std::string(nameOf(unit)) + " it would be " + rounded(ns(unit) * 1e-9) +
+             " s: is that the unit (lidar.time_unit)?";
+    }
+  }
+  // A part of a scan may be short; there is nothing to mend.
+  if (is_short && cure.empty()) return;
+  decision->warning = true;
+  decision->text += "; the scan spans " + rounded(ns(decision->unit) * 1e-9) + " s, " +
+                    (is_short ? "less than 1 ms" : "more than lidar.longest_scan_s") + cure;
+}
+
 /// Decides unit and reference of one cloud's times.
-TimeDecision decide(const Field& field, const RawTimes& raw, double lowest, double highest,
-                    StampNs header_stamp, const PointCloudReaderConfig& config) {
+TimeDecision decide(const Field& field, const RawTimes& raw, const Bulk& bulk, StampNs header_stamp,
+                    const PointCloudReaderConfig& config) {
   TimeDecision decision;
   decision.field = field.name;
   decision.unit = config.time_unit;
   decision.reference = config.time_reference;
-  const double middle = lowest + (highest - lowest) / 2.0;
   const bool wide =
       field.datatype == kFloat64 || field.datatype == kInt64 || field.datatype == kUint64;
 
@@ -282,12 +384,12 @@ TimeDecision decide(const Field& field, const RawTimes& raw, double lowest, doub
                                 TimeUnit::kMicroseconds, TimeUnit::kNanoseconds}) {
       if (config.time_unit != TimeUnit::kAuto && config.time_unit != unit) continue;
       const TimeUnit usual = raw.integer ? TimeUnit::kNanoseconds : TimeUnit::kSeconds;
-      const double span_ns = (highest - lowest) * static_cast<double>(nsOf(unit));
+      const double span_ns = bulk.span() * static_cast<double>(nsOf(unit));
       if (decision.reference == TimeReference::kAuto && config.time_unit == TimeUnit::kAuto &&
           span_ns > static_cast<double>(unit == usual ? 10 * kNsPerSecond : kNsPerSecond)) {
         continue;
       }
-      const double ns = middle * static_cast<double>(nsOf(unit));
+      const double ns = bulk.middle * static_cast<double>(nsOf(unit));
       const double distance = std::abs(ns - static_cast<double>(header_stamp));
       if (distance < best_distance) {
         best_distance = distance;
@@ -303,14 +405,16 @@ TimeDecision decide(const Field& field, const RawTimes& raw, double lowest, doub
   }
   if (decision.reference == TimeReference::kAuto) decision.reference = TimeReference::kStamp;
   if (decision.unit == TimeUnit::kAuto) {
-    decision.unit = raw.integer ? TimeUnit::kNanoseconds : unitOfSpan(highest - lowest);
+    decision.unit = raw.integer ? TimeUnit::kNanoseconds : unitOfSpan(bulk.span());
   }
-  decision.instant = lowest == highest && raw.size() > 1;
+  decision.instant = bulk.first == bulk.last && raw.size() > 1;
   decision.text = "point times: field '" + field.name + "' (" + nameOf(field.datatype) + ") in " +
                   nameOf(decision.unit) + " " + nameOf(decision.reference);
   if (decision.instant) {
     decision.warning = true;
     decision.text += "; all are equal: the cloud is taken as an instant";
+  } else if (raw.size() >= kManyPoints) {
+    judgeSpan(bulk.span(), config.longest_scan_ns, &decision);
   }
   return decision;
 }
@@ -318,7 +422,7 @@ TimeDecision decide(const Field& field, const RawTimes& raw, double lowest, doub
 /// The points that come out, as far as they do not concern time.
 struct Points {
   std::vector<const std::uint8_t*> bytes;
-  RawTimes times;
+  RawTimes times;  ///< of each; none without a time field
 };
 
 /// Finite, also as a float.
@@ -326,31 +430,106 @@ bool isUsable(double value) {
   return std::abs(value) <= static_cast<double>(std::numeric_limits<float>::max());
 }
 
-/// Finite points (also in time), in order.
-Points finitePoints(const PointCloudBytes& cloud, const std::array<Field, 3>& xyz,
-                    const Field& time) {
-  Points points;
-  points.bytes.reserve(std::size_t{cloud.width} * cloud.height);
-  const bool timed = time.datatype != 0;
-  points.times.integer = timed && time.isInteger();
+using Position = std::array<double, 3>;
+
+Position positionOf(const std::uint8_t* point, const std::array<Field, 3>& xyz) {
+  return {{xyz[0].asDouble(point), xyz[1].asDouble(point), xyz[2].asDouble(point)}};
+}
+
+/// Positions that so many points share that none measured them: what a driver writes for beams
+/// without a return.
+std::vector<Position> fillers(const std::vector<const std::uint8_t*>& points,
+                              const std::array<Field, 3>& xyz) {
+  constexpr std::size_t kFewest = 100, kLooks = 512, kSuspicious = 5;
+  constexpr double kShare = 0.01;
+  if (points.size() < kFewest) return {};
+  std::vector<Position> seen(std::min(points.size(), kLooks));
+  for (std::size_t k = 0; k < seen.size(); ++k) {
+    const std::size_t i = points.size() <= kLooks ? k : spread(k, points.size());
+    seen[k] = positionOf(points[i], xyz);
+  }
+  std::sort(seen.begin(), seen.end());
+  std::vector<Position> result;
+  for (auto first = seen.begin(); first != seen.end();) {
+    const auto end = std::upper_bound(first, seen.end(), *first);
+    if (static_cast<std::size_t>(end - first) >= kSuspicious) {
+      const auto equal = static_cast<std::size_t>(std::count_if(
+          points.begin(), points.end(),
+          [&](const std::uint8_t* point) { return positionOf(point, xyz) == *first; }));
+      // A cloud of one position alone tells nothing.
+      if (static_cast<double>(equal) >= kShare * static_cast<double>(points.size()) &&
+          equal >= 16 && equal < points.size()) {
+        result.push_back(*first);
+      }
+    }
+    first = end;
+  }
+  return result;
+}
+
+/// The points that were measured, in order: finite, not (0, 0, 0), not a filler, within all limits.
+std::vector<const std::uint8_t*> measuredPoints(const PointCloudBytes& cloud,
+                                                std::uint64_t row_bytes,
+                                                const std::array<Field, 3>& xyz,
+                                                const PointCloudReaderConfig& config,
+                                                PointCloudCounters* counters) {
+  std::vector<const std::uint8_t*> points;
+  points.reserve(std::size_t{cloud.width} * cloud.height);
   for (std::uint32_t row = 0; row < cloud.height; ++row) {
     for (std::uint32_t column = 0; column < cloud.width; ++column) {
       const std::uint8_t* const point =
-          cloud.data + std::size_t{row} * cloud.row_step + std::size_t{column} * cloud.point_step;
-      if (!isUsable(xyz[0].asDouble(point)) || !isUsable(xyz[1].asDouble(point)) ||
-          !isUsable(xyz[2].asDouble(point))) {
-        continue;
+          cloud.data + row * row_bytes + std::size_t{column} * cloud.point_step;
+      const Position at = positionOf(point, xyz);
+      if (!isUsable(at[0]) || !isUsable(at[1]) || !isUsable(at[2])) {
+        ++counters->non_finite_points;
+      } else if (at[0] == 0.0 && at[1] == 0.0 && at[2] == 0.0) {
+        ++counters->no_return_points;
+      } else if (std::abs(at[0]) > config.largest_coordinate_m ||
+                 std::abs(at[1]) > config.largest_coordinate_m ||
+                 std::abs(at[2]) > config.largest_coordinate_m) {
+        ++counters->far_points;
+      } else if (outOfRange(std::sqrt(at[0] * at[0] + at[1] * at[1] + at[2] * at[2]),
+                            config.min_range_m, config.max_range_m)) {
+        ++counters->out_of_range_points;
+      } else {
+        points.push_back(point);
       }
-      if (timed && points.times.integer) {
-        points.times.integers.push_back(time.asInteger(point));
-      } else if (timed) {
-        const double value = time.asDouble(point);
-        if (!std::isfinite(value)) continue;
-        points.times.floats.push_back(value);
-      }
-      points.bytes.push_back(point);
     }
   }
+  const std::vector<Position> none = fillers(points, xyz);
+  if (none.empty()) return points;
+  const auto kept = std::remove_if(points.begin(), points.end(), [&](const std::uint8_t* point) {
+    return std::find(none.begin(), none.end(), positionOf(point, xyz)) != none.end();
+  });
+  counters->no_return_points += static_cast<std::size_t>(points.end() - kept);
+  points.erase(kept, points.end());
+  return points;
+}
+
+/// Adds the raw times; points whose time is not finite are left out.
+Points timedPoints(std::vector<const std::uint8_t*> bytes, const Field& time,
+                   PointCloudCounters* counters) {
+  Points points;
+  points.bytes = std::move(bytes);
+  if (time.datatype == 0) return points;
+  points.times.integer = time.isInteger();
+  if (points.times.integer) {
+    points.times.integers.reserve(points.bytes.size());
+    for (const std::uint8_t* const point : points.bytes) {
+      points.times.integers.push_back(time.asInteger(point));
+    }
+    return points;
+  }
+  std::size_t kept = 0;
+  points.times.floats.reserve(points.bytes.size());
+  for (const std::uint8_t* const point : points.bytes) {
+    const double value = time.asDouble(point);
+    if (!std::isfinite(value)) continue;
+    points.times.floats.push_back(value);
+    points.bytes[kept++] = point;
+  }
+  counters->non_finite_points += points.bytes.size() - kept;
+  points.bytes.resize(kept);
   if (time.datatype == kFloat64 && areIntegerImages(points.times)) {
     points.times.integer = true;
     for (const double value : points.times.floats) {
@@ -361,31 +540,96 @@ Points finitePoints(const PointCloudBytes& cloud, const std::array<Field, 3>& xy
   return points;
 }
 
-/// True times from raw ones.
-std::vector<StampNs> trueTimes(const RawTimes& raw, StampNs header_stamp, TimeDecision& decision,
-                               const PointCloudReaderConfig& config) {
-  const StampNs unit_ns = nsOf(decision.unit);
+/// Which times belong to the scan: those within longest_scan of the middle one, but for a few that
+/// lie far from all others.
+std::vector<bool> withinScan(const std::vector<StampNs>& times, StampNs middle,
+                             StampNs longest_scan_ns) {
+  // How many lie in each ms around the middle one.
+  constexpr StampNs kBinNs = 1000000;
+  const auto reach = static_cast<std::ptrdiff_t>(longest_scan_ns / kBinNs + 1);
+  std::vector<std::size_t> bins(static_cast<std::size_t>(2 * reach + 1));
+  const auto binOf = [&](StampNs time) -> std::ptrdiff_t {
+    const StampNs since = time - middle;
+    const bool far = since > longest_scan_ns || since < -longest_scan_ns;
+    return far ? -1 : static_cast<std::ptrdiff_t>((since + reach * kBinNs) / kBinNs);
+  };
+  for (const StampNs time : times) {
+    const std::ptrdiff_t bin = binOf(time);
+    if (bin >= 0) ++bins[static_cast<std::size_t>(bin)];
+  }
+  // From the middle to the first pause that is longer than a turn and than all up to it.
+  std::ptrdiff_t first = reach, last = reach;
+  for (std::ptrdiff_t k = 1; k <= reach; ++k) {
+    const std::ptrdiff_t pause = std::max<std::ptrdiff_t>(kLoneNs / kBinNs, last - first);
+    if (bins[static_cast<std::size_t>(reach - k)] > 0 && first - (reach - k) <= pause) {
+      first = reach - k;
+    }
+    if (bins[static_cast<std::size_t>(reach + k)] > 0 && reach + k - last <= pause) {
+      last = reach + k;
+    }
+  }
+  std::vector<bool> lone(bins.size(), false);
+  std::size_t lone_count = 0;
+  for (std::ptrdiff_t bin = 0; bin < static_cast<std::ptrdiff_t>(bins.size()); ++bin) {
+    if (bin >= first && bin <= last) continue;
+    lone[static_cast<std::size_t>(bin)] = true;
+    lone_count += bins[static_cast<std::size_t>(bin)];
+  }
+  const bool few = static_cast<double>(lone_count) <= kFew * static_cast<double>(times.size());
+  std::vector<bool> within(times.size());
+  for (std::size_t i = 0; i < times.size(); ++i) {
+    const std::ptrdiff_t bin = binOf(times[i]);
+    within[i] = bin >= 0 && !(few && lone[static_cast<std::size_t>(bin)]);
+  }
+  return within;
+}
+
+/// True times from raw ones. Points whose time is none of the scan's are taken out of `points`.
+std::vector<StampNs> trueTimes(Points* points, StampNs header_stamp, TimeDecision* decision,
+                               const PointCloudReaderConfig& config, PointCloudCounters* counters) {
+  const RawTimes& raw = points->times;
+  const StampNs unit_ns = nsOf(decision->unit);
   std::vector<StampNs> times(raw.size());
   for (std::size_t i = 0; i < raw.size(); ++i) {
-    if (std::abs(raw.asDouble(i)) * static_cast<double>(unit_ns) > kLargestNs) {
-      refuse("field '" + decision.field + "' holds " + std::to_string(raw.asDouble(i)) + " " +
-             nameOf(decision.unit) + ", which no clock shows");
-    }
-    times[i] = raw.integer ? raw.integers[i] * unit_ns : toUnit(raw.floats[i], unit_ns);
+    const double ns = raw.asDouble(i) * static_cast<double>(unit_ns);
+    times[i] = std::abs(ns) > kLargestNs ? (ns > 0.0 ? kNoClockNs : -kNoClockNs)
+               : raw.integer             ? raw.integers[i] * unit_ns
+                                         : toUnit(raw.floats[i], unit_ns);
   }
+  std::vector<StampNs> sorted(std::min(times.size(), kSample));
+  for (std::size_t k = 0; k < sorted.size(); ++k) {
+    sorted[k] = times[times.size() <= kSample ? k : spread(k, times.size())];
+  }
+  const auto half = sorted.begin() + static_cast<std::ptrdiff_t>(sorted.size() / 2);
+  std::nth_element(sorted.begin(), half, sorted.end());
+  if (std::abs(*half) >= kNoClockNs) {
+    refuse("field '" + decision->field + "' in " + nameOf(decision->unit) +
+           " holds times that no clock shows");
+  }
+  const std::vector<bool> within = withinScan(times, *half, config.longest_scan_ns);
+  StampNs first = std::numeric_limits<StampNs>::max(), last = std::numeric_limits<StampNs>::min();
+  std::size_t kept = 0;
+  for (std::size_t i = 0; i < times.size(); ++i) {
+    if (!within[i]) continue;
+    first = std::min(first, times[i]);
+    last = std::max(last, times[i]);
+    points->bytes[kept] = points->bytes[i];
+    times[kept++] = times[i];
+  }
+  counters->time_outliers = times.size() - kept;
+  times.resize(kept);
+  points->bytes.resize(kept);
+
   StampNs origin = config.time_offset_ns;
-  if (decision.reference != TimeReference::kAbsolute) {
-    const auto span = std::minmax_element(times.begin(), times.end());
-    const StampNs first = *span.first;
-    const StampNs last = *span.second;
+  if (decision->reference != TimeReference::kAbsolute) {
     origin += header_stamp;
-    if (decision.reference == TimeReference::kScanEnd) {
+    if (decision->reference == TimeReference::kScanEnd) {
       origin -= std::max<StampNs>(last, 0);
     } else if (config.time_reference == TimeReference::kAuto &&
                (first < -kLongestOffsetNs || last > kLongestOffsetNs)) {
       origin -= first;
-      decision.warning = true;
-      decision.text +=
+      decision->warning = true;
+      decision->text +=
           "; they are of another clock than the header stamp, which the earliest point takes";
     }
   }
@@ -426,6 +670,26 @@ std::vector<StampNs> timesFromAzimuth(const std::vector<double>& azimuth, StampN
   return times;
 }
 
+/// For clouds without a time field.
+std::vector<StampNs> timesWithoutField(const std::vector<const std::uint8_t*>& points,
+                                       const std::array<Field, 3>& xyz, StampNs header_stamp,
+                                       const PointCloudReaderConfig& config,
+                                       TimeDecision* decision) {
+  decision->warning = true;
+  const StampNs begin_ns = header_stamp + config.time_offset_ns;
+  if (config.without_time != WithoutTime::kAzimuth) {
+    decision->instant = true;
+    decision->text = "point times: the cloud is taken as an instant";
+    return std::vector<StampNs>(points.size(), begin_ns);
+  }
+  std::vector<double> azimuth;
+  for (const std::uint8_t* const point : points) {
+    azimuth.push_back(std::atan2(xyz[1].asDouble(point), xyz[0].asDouble(point)));
+  }
+  decision->text = "point times: from the azimuth, one turn from the header stamp on";
+  return timesFromAzimuth(azimuth, begin_ns, config.sweep_period_ns);
+}
+
 /// One firing for each distinct time, in order of time; each point's index into them.
 void groupByTime(TimedCloud& cloud) {
   std::vector<StampNs> distinct = cloud.time_ns;
@@ -457,6 +721,10 @@ void groupByTime(TimedCloud& cloud) {
 PointCloudReader::PointCloudReader(PointCloudReaderConfig config) : config_(std::move(config)) {
   std::vector<std::string> problems;
   checkRangeLimits(config_.min_range_m, config_.max_range_m, problems);
+  if (config_.longest_scan_ns < kShortestNs) {
+    problems.push_back("lidar.longest_scan_s is " + std::to_string(config_.longest_scan_ns) +
+                       " ns, must be at least 1 ms");
+  }
   if (config_.sweep_period_ns <= 0) {
     problems.push_back("sweep_period_ns is " + std::to_string(config_.sweep_period_ns) +
                        ", must be more than 0");
@@ -474,80 +742,61 @@ ReadCloud PointCloudReader::read(const PointCloudBytes& bytes) const {
     return result;
   }
 
-  checkLayout(bytes);
+  const std::uint64_t row_bytes = checkLayout(bytes);
+  if (row_bytes != bytes.row_step) {
+    result.notes.push_back(
+        "row_step is not width x point_step, as which it is taken: the data fit");
+  }
   const std::array<Field, 3> xyz{
       {findCoordinate(bytes, "x"), findCoordinate(bytes, "y"), findCoordinate(bytes, "z")}};
-  const Field intensity = findField(bytes, "intensity");
-  Field ring;
-  for (const char* const name : kRingNames) {
-    if (ring.datatype == 0) ring = findField(bytes, name);
+  const Field intensity = findField(bytes, kIntensityNames);
+  const Field ring = findField(bytes, kRingNames);
+  if (ring.datatype == 0) {
+    result.notes.push_back("no field of the laser's ring (" + listed(kRingNames) +
+                           "); the cloud's fields are " + fieldNames(bytes));
   }
   const Field time = findTime(bytes, config_.time_field);
+  const std::string no_time = "no time field (" + listed(kTimeNames) +
+                              ", or set lidar.time_field); the cloud's fields are " +
+                              fieldNames(bytes);
   if (time.datatype == 0 && config_.without_time == WithoutTime::kReject) {
-    refuse(
-        "has no time field (t, time, timestamp, time_stamp, offset_time) and lidar.without_time is "
-        "reject");
+    refuse("has " + no_time + ", and lidar.without_time is reject");
   }
 
-  const Points points = finitePoints(bytes, xyz, time);
-  const std::size_t count = points.bytes.size();
-  result.counters.points = std::size_t{bytes.width} * bytes.height;
-  result.counters.non_finite_points = result.counters.points - count;
-
-  if (count == 0) {
-    result.time.text = "point times: no point is finite";
+  PointCloudCounters& counters = result.counters;
+  counters.points = std::size_t{bytes.width} * bytes.height;
+  Points points =
+      timedPoints(measuredPoints(bytes, row_bytes, xyz, config_, &counters), time, &counters);
+  if (points.bytes.empty()) {
+    result.time.text = "point times: the cloud has no point within the limits";
     return result;
   }
 
   std::vector<StampNs> times;
   if (time.datatype != 0) {
-    double lowest = std::numeric_limits<double>::infinity();
-    double highest = -lowest;
-    for (std::size_t i = 0; i < count; ++i) {
-      lowest = std::min(lowest, points.times.asDouble(i));
-      highest = std::max(highest, points.times.asDouble(i));
-    }
-    result.time = decide(time, points.times, lowest, highest, bytes.header_stamp, config_);
-    times = trueTimes(points.times, bytes.header_stamp, result.time, config_);
+    const Bulk bulk =
+        bulkOf(points.times.size(), [&](std::size_t i) { return points.times.asDouble(i); });
+    result.time = decide(time, points.times, bulk, bytes.header_stamp, config_);
+    times = trueTimes(&points, bytes.header_stamp, &result.time, config_, &counters);
   } else {
-    result.time.warning = true;
-    const StampNs begin_ns = bytes.header_stamp + config_.time_offset_ns;
-    if (config_.without_time == WithoutTime::kAzimuth) {
-      std::vector<double> azimuth(count);
-      for (std::size_t i = 0; i < count; ++i) {
-        azimuth[i] = std::atan2(xyz[1].asDouble(points.bytes[i]), xyz[0].asDouble(points.bytes[i]));
-      }
-      times = timesFromAzimuth(azimuth, begin_ns, config_.sweep_period_ns);
-      result.time.text =
-          "point times: no time field; from the azimuth, one turn from the header stamp on";
-    } else {
-      times.assign(count, begin_ns);
-      result.time.instant = true;
-      result.time.text = "point times: no time field; the cloud is taken as an instant";
-    }
+    times = timesWithoutField(points.bytes, xyz, bytes.header_stamp, config_, &result.time);
+    result.time.text += "; " + no_time;
   }
 
-  cloud.reserve(count);
-  for (std::size_t i = 0; i < count; ++i) {
+  cloud.reserve(points.bytes.size());
+  for (std::size_t i = 0; i < points.bytes.size(); ++i) {
     const std::uint8_t* const point = points.bytes[i];
-    const double x = xyz[0].asDouble(point);
-    const double y = xyz[1].asDouble(point);
-    const double z = xyz[2].asDouble(point);
-    if (outOfRange(std::sqrt(x * x + y * y + z * z), config_.min_range_m, config_.max_range_m)) {
-      ++result.counters.out_of_range_points;
-      continue;
-    }
     const double ring_value = ring.datatype != 0 ? ring.asDouble(point) : -1.0;
-    cloud.x.push_back(static_cast<float>(x));
-    cloud.y.push_back(static_cast<float>(y));
-    cloud.z.push_back(static_cast<float>(z));
+    cloud.x.push_back(static_cast<float>(xyz[0].asDouble(point)));
+    cloud.y.push_back(static_cast<float>(xyz[1].asDouble(point)));
+    cloud.z.push_back(static_cast<float>(xyz[2].asDouble(point)));
     const double brightness = intensity.datatype != 0 ? intensity.asDouble(point) : 0.0;
     cloud.intensity.push_back(isUsable(brightness) ? static_cast<float>(brightness) : 0.0f);
     cloud.ring.push_back(ring_value >= 0.0 && ring_value < kNoRing
                              ? static_cast<std::uint16_t>(ring_value)
                              : kNoRing);
-    cloud.time_ns.push_back(times[i]);
   }
+  cloud.time_ns = std::move(times);
   groupByTime(cloud);
   return result;
 }

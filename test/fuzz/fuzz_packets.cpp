@@ -31,14 +31,13 @@ Bytes scanOf(unsigned config, PacketEncoder::Config encoder_config, int packets)
 
 std::vector<Bytes> seeds() {
   std::vector<Bytes> all{Bytes{}};
-  for (const LidarModel model :
-       {LidarModel::kVlp16, LidarModel::kPuckHiRes, LidarModel::kVlp32c, LidarModel::kHdl32e}) {
+  for (std::size_t i = 0; i < lidarSpecs().size(); ++i) {
     for (const bool dual : {false, true}) {
       PacketEncoder::Config config;
-      config.model = model;
+      config.model = lidarSpecs()[i].name;
       config.dual_return = dual;
       config.start_azimuth_deg = 359.0;
-      all.push_back(scanOf(static_cast<unsigned>(model) + (dual ? 16u : 0u), config, 2));
+      all.push_back(scanOf(static_cast<unsigned>(i) + (dual ? 16u : 0u), config, 2));
     }
   }
   return all;
@@ -49,7 +48,7 @@ void run(const std::uint8_t* data, std::size_t size) {
   const unsigned options = reader.take<std::uint8_t>();
   const unsigned more = reader.take<std::uint8_t>();
   LidarConfig config;
-  if (more & 1u) config.model = static_cast<LidarModel>(options % 4);
+  if (more & 1u) config.model = &lidarSpecs()[options % 16 % lidarSpecs().size()];
   config.packet_stamp = static_cast<PacketStamp>((options >> 4) % 3);
   if (more & 2u) config.min_range_m = 0.5, config.max_range_m = 30.0;
   if (more & 4u) config.time_offset_s = -1e9;

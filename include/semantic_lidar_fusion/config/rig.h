@@ -13,6 +13,7 @@
 
 #include "semantic_lidar_fusion/common/label_set.h"
 #include "semantic_lidar_fusion/config/overlap_rule.h"
+#include "semantic_lidar_fusion/lidar/lidar_spec.h"
 #include "semantic_lidar_fusion/lidar/packet.h"
 #include "semantic_lidar_fusion/lidar/point_cloud_reader.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
@@ -52,11 +53,14 @@ enum class LidarInput : std::uint8_t { kPackets, kPoints };
 
 struct LidarConfig {
   LidarInput input = LidarInput::kPackets;
-  std::string topic;                ///< default: velodyne_packets or points, after `input`
-  std::optional<LidarModel> model;  ///< key `model: auto|VLP16|PuckHiRes|VLP32C|HDL32E`
-  std::string frame;                ///< overrides the messages' frame; empty = theirs
-  double min_range_m = 0.0;         ///< 0 = no limit
+  std::string topic;                 ///< default: velodyne_packets or points, after `input`
+  const LidarSpec* model = nullptr;  ///< key `model: auto|NAME`; null = auto, see lidarSpecs()
+  std::string frame;                 ///< overrides the messages' frame; empty = theirs
+  double min_range_m = 0.0;          ///< 0 = no limit
   double max_range_m = 0.0;
+  double largest_coordinate_m = 10000.0;  ///< of a point; beyond it none is measured
+  double longest_scan_s =
+      1.0;                 ///< points and packets farther than this from the middle are outliers
   std::string time_field;  ///< empty = detect
   TimeUnit time_unit = TimeUnit::kAuto;
   TimeReference time_reference = TimeReference::kAuto;

@@ -19,8 +19,6 @@ struct Packet {
   std::array<std::uint8_t, kPacketBytes> data{};
 };
 
-enum class LidarModel : std::uint8_t { kVlp16, kPuckHiRes, kVlp32c, kHdl32e };
-
 /// Which moment of a packet its stamp tells.
 enum class PacketStamp : std::uint8_t { kStart, kMiddle, kEnd };
 

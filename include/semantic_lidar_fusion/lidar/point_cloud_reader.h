@@ -3,7 +3,8 @@
 ///
 /// Drivers agree neither on the name nor on the unit nor on the origin of per-point times. Unless
 /// the configuration says otherwise:
-///   - the field is the first of t, time, timestamp, time_stamp, offset_time;
+///   - the field is the first of t, time, timestamp, time_stamp, offset_time, time_offset,
+///     timestamps;
 ///   - integers of up to 32 bits are ns after the header stamp;
 ///   - 32-bit floats are s after the header stamp, with their sign; a span above 1 means the
 ///   coarsest
@@ -18,6 +19,9 @@
 ///   header
 ///     stamp, with a warning;
 ///   - all equal is an instant, with a warning.
+/// Beams without a return, (0, 0, 0) or what else many points share, are left out before. Every
+/// decision is that of the bulk of the points; times beyond `longest_scan_ns` from the middle one,
+/// or a few that lie far from all others, are wrong and their points are left out.
 #pragma once
 
 #include <cstddef>
@@ -26,18 +30,10 @@
 #include <vector>
 
 #include "semantic_lidar_fusion/common/point_cloud.h"
+#include "semantic_lidar_fusion/lidar/time_decision.h"
 
 namespace semantic_lidar_fusion {
 
-enum class TimeUnit : std::uint8_t { kAuto, kSeconds, kMilliseconds, kMicroseconds, kNanoseconds };
-/// What a time field counts from.
-enum class TimeReference : std::uint8_t {
-  kAuto,
-  kStamp,     ///< the header stamp
-  kAbsolute,  ///< the epoch
-  kScanEnd,   ///< the header stamp is the scan's end: times up to 0 count from it, of others the
-              ///< latest point takes it
-};
 /// What to do with clouds that have no time field.
 enum class WithoutTime : std::uint8_t {
   kReject,
@@ -55,6 +51,8 @@ struct PointCloudReaderConfig {
   StampNs time_offset_ns = 0;           ///< true time = stamp (or absolute time) + this
   double min_range_m = 0.0;             ///< nearer points do not come out; 0 = no limit
   double max_range_m = 0.0;             ///< farther points do not come out; 0 = no limit
+  double largest_coordinate_m = 1e4;  ///< points with a larger |x|, |y| or |z| are no measurements
+  StampNs longest_scan_ns = kNsPerSecond;  ///< points farther than this from the middle are wrong
 };
 
 /// As sensor_msgs/PointField.
@@ -79,19 +77,12 @@ struct PointCloudBytes {
   std::size_t size = 0;
 };
 
-/// How the points' times were understood; the same for every cloud of one driver.
-struct TimeDecision {
-  std::string field;  ///< empty: no time field
-  TimeUnit unit = TimeUnit::kAuto;
-  TimeReference reference = TimeReference::kAuto;
-  bool instant = false;  ///< all points have one time
-  bool warning = false;  ///< worth a warning: no per-point time, or of another clock
-  std::string text;      ///< one line for a log, without figures of the single cloud
-};
-
 struct PointCloudCounters {
   std::size_t points = 0;             ///< all that were given
   std::size_t non_finite_points = 0;  ///< dropped: a coordinate or the time is NaN or infinite
+  std::size_t no_return_points = 0;   ///< dropped: (0, 0, 0), or a position that many points share
+  std::size_t far_points = 0;         ///< dropped: beyond largest_coordinate_m
+  std::size_t time_outliers = 0;      ///< dropped: a time that is none of the scan's
   std::size_t out_of_range_points = 0;
 };
 
@@ -99,6 +90,7 @@ struct ReadCloud {
   TimedCloud cloud;  ///< one firing for each distinct time
   TimeDecision time;
   PointCloudCounters counters;
+  std::vector<std::string> notes;  ///< what else a user should know of the layout, one line each
 };
 
 class PointCloudReader {

@@ -123,7 +123,9 @@ void BagFusion::measureScans() {
     checkpoint_();
   }
   counts_points_ = false;
-  if (lidar_.timeDecisionIsDoubtful()) DropLog::warn("lidar: " + lidar_.timeDecision());
+  for (const LidarDecoder::Note& note : lidar_.takeNotes()) {
+    if (note.warning) DropLog::warn("lidar: " + note.text);
+  }
 }
 
 /// The images of a camera that can be chosen, by true time: where the bag has no scores of the

@@ -5,7 +5,7 @@
 #include <cmath>
 #include <thread>
 
-#include "semantic_lidar_fusion/lidar/firing_times.h"
+#include "semantic_lidar_fusion/lidar/lidar_spec.h"
 #include "tools/simulate_drive/materials.h"
 #include "tools/simulate_drive/noise.h"
 
@@ -25,9 +25,11 @@ void put16(Packet* packet, int at, unsigned value) {
   packet->data[static_cast<std::size_t>(at) + 1] = static_cast<std::uint8_t>(value >> 8U);
 }
 
+const LidarSpec& simulatedLidar() { return *findLidarSpec("VLP16"); }
+
 }  // namespace
 
-StampNs packetPeriodNs() { return firingTimes(LidarModel::kVlp16).packetNs(false); }
+StampNs packetPeriodNs() { return simulatedLidar().packetNs(false); }
 
 int firstPacketOfScan(int index) {
   return static_cast<int>(std::floor(index / kLidarTurnsPerS / toSeconds(packetPeriodNs()) + 0.5));
@@ -37,21 +39,21 @@ namespace {
 
 void simulatePacket(const DrivePath& path, const LidarOptions& options, int number,
                     const World& world, Packet* packet, std::vector<Echo>* echoes) {
-  const FiringTimes& times = firingTimes(LidarModel::kVlp16);
+  const LidarSpec& spec = simulatedLidar();
   const StampNs begin_ns = number * packetPeriodNs();  // since time 0
   const auto azimuthAt = [](StampNs ns) {
     return kStartAzimuthRad + 2.0 * kPi * kLidarTurnsPerS * toSeconds(ns);
   };
   packet->stamp = options.start_ns + begin_ns;
   for (int block = 0; block < kBlocksPerPacket; ++block) {
-    const StampNs block_ns = begin_ns + block * times.blockNs();
+    const StampNs block_ns = begin_ns + block * spec.slotNs();
     put16(packet, 100 * block, 0xEEFFU);
     const long centidegrees = std::lround(azimuthAt(block_ns) * 18000.0 / kPi) % 36000;
     put16(packet, 100 * block + 2, static_cast<unsigned>(centidegrees));
-    for (int firing = 0; firing < times.firings_per_block; ++firing) {
-      const StampNs firing_ns = block_ns + firing * times.firing_ns;
-      for (int l = 0; l < times.laser_count; ++l) {
-        const Laser& laser = times.lasers[static_cast<std::size_t>(l)];
+    for (int firing = 0; firing < spec.firingsPerSlot(); ++firing) {
+      const StampNs firing_ns = block_ns + firing * spec.firing_ns;
+      for (int l = 0; l < spec.laserCount(); ++l) {
+        const Laser& laser = spec.lasers[static_cast<std::size_t>(l)];
         const StampNs shot_ns = firing_ns + laser.time_ns;
         const double t = toSeconds(shot_ns);
         const double azimuth = azimuthAt(shot_ns) + laser.azimuth_offset_rad;
@@ -74,11 +76,11 @@ void simulatePacket(const DrivePath& path, const LidarOptions& options, int numb
         if (signal < 1.0 + 0.3 * random.normal()) continue;
         const double noise = options.range_noise ? kRangeSigmaM * random.normal() : 0.0;
         const unsigned raw = static_cast<unsigned>(
-            std::lround(std::max(hit.range + noise, kMinRangeM) / times.distance_unit_m));
+            std::lround(std::max(hit.range + noise, kMinRangeM) / spec.distance_unit_m));
         const double brightness = 100.0 * response.reflectivity * (0.4 + 0.6 * cosine) +
                                   (response.reflectivity >= 1.0F ? 120.0 : 0.0) +
                                   2.0 * random.normal();
-        const int at = 100 * block + 4 + 3 * (firing * times.laser_count + l);
+        const int at = 100 * block + 4 + 3 * (firing * spec.laserCount() + l);
         put16(packet, at, raw);
         packet->data[static_cast<std::size_t>(at) + 2] =
             static_cast<std::uint8_t>(std::min(std::max(brightness, 0.0), 255.0));

@@ -4,7 +4,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "semantic_lidar_fusion/lidar/firing_times.h"
+#include "semantic_lidar_fusion/lidar/lidar_spec.h"
 #include "semantic_lidar_fusion/projection/occlusion_config.h"
 
 namespace semantic_lidar_fusion {
@@ -20,7 +20,7 @@ constexpr double kSilhouetteM = 0.3;
 
 float azimuthStepRad() {
   return static_cast<float>(2.0 * kPiF * kLidarTurnsPerS *
-                            toSeconds(firingTimes(LidarModel::kVlp16).firing_ns));
+                            toSeconds(findLidarSpec("VLP16")->firing_ns));
 }
 
 /// Whether something else lies before the point on a line of sight up to one beam beside its own.

@@ -145,7 +145,7 @@ threads: 3
   EXPECT_EQ(camera.reorder_window_s, 0.1);
   EXPECT_EQ(rig.lidar.input, LidarInput::kPoints);
   EXPECT_EQ(rig.lidar.topic, "/ouster/points");
-  EXPECT_EQ(rig.lidar.model, LidarModel::kVlp32c);
+  EXPECT_EQ(rig.lidar.model, findLidarSpec("VLP32C"));
   EXPECT_EQ(rig.lidar.frame, "os");
   EXPECT_EQ(rig.lidar.min_range_m, 1);
   EXPECT_EQ(rig.lidar.max_range_m, 90);
@@ -232,13 +232,15 @@ TEST(RigTest, ClassesMayBeAPathAFileKeyOrInPlace) {
 }
 
 TEST(RigTest, KnowsTheLidarsByTheirMakersNamesToo) {
-  const std::pair<const char*, LidarModel> names[] = {
-      {"VLP16", LidarModel::kVlp16},           {"VLP-16", LidarModel::kVlp16},
-      {"Puck LITE", LidarModel::kVlp16},       {"PuckHiRes", LidarModel::kPuckHiRes},
-      {"Puck Hi-Res", LidarModel::kPuckHiRes}, {"Hi-Res", LidarModel::kPuckHiRes},
-      {"VLP-32C", LidarModel::kVlp32c},        {"HDL-32E", LidarModel::kHdl32e}};
+  const std::pair<const char*, const char*> names[] = {
+      {"VLP16", "VLP16"},         {"VLP-16", "VLP16"},     {"Puck LITE", "VLP16"},
+      {"PuckHiRes", "PuckHiRes"}, {"Hi-Res", "PuckHiRes"}, {"Puck Hi-Res", "PuckHiRes"},
+      {"VLP-32C", "VLP32C"},      {"HDL-32E", "HDL32E"},   {"VLS-128", "VLS128"},
+      {"alpha prime", "VLS128"},  {"Ultra Puck", "VLP32C"}};
   for (const auto& [name, model] : names) {
-    EXPECT_EQ(parse("lidar: {model: " + std::string(name) + "}").lidar.model, model) << name;
+    const LidarSpec* const found = parse("lidar: {model: " + std::string(name) + "}").lidar.model;
+    ASSERT_NE(found, nullptr) << name;
+    EXPECT_EQ(found->name, model) << name;
   }
 }
 

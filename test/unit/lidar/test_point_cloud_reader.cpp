@@ -42,7 +42,11 @@ struct Message {
     header.fields.push_back({name, offset, datatype, count});
     return *this;
   }
-  Message& xyz() { return field("x", 0, kFloat32).field("y", 4, kFloat32).field("z", 8, kFloat32); }
+  /// Points at (0, 0, 1).
+  Message& xyz() {
+    for (std::size_t i = 0; i < std::size_t{header.width} * header.height; ++i) set(i, 8, 1.0f);
+    return field("x", 0, kFloat32).field("y", 4, kFloat32).field("z", 8, kFloat32);
+  }
   template <typename T>
   void set(std::size_t i, std::uint32_t offset, T value) {
     const std::size_t row = i / header.width;
@@ -284,6 +288,88 @@ TEST(PointCloudReader, EqualTimesAreAnInstantWithAWarning) {
   EXPECT_EQ(read.cloud.time_ns, std::vector<StampNs>(5, kStart));
 }
 
+/// The clouds of a convention with the raw times of some points replaced by those of
+/// kStart + ns: what comes out must be as without them.
+TEST(PointCloudReader, AFewWrongTimesChangeNothingForTheOthers) {
+  const StampNs s = kNsPerSecond;
+  for (const Convention& c : conventions()) {
+    for (const StampNs wrong :
+         std::vector<StampNs>{3604361924, 2 * s, 500 * s / 1000, 300 * s / 1000, -2 * s, -s / 2,
+                              3600 * s, -3600 * s, -kStart}) {
+      for (const std::vector<std::size_t>& which :
+           {std::vector<std::size_t>{0}, {500}, {kPoints - 1}, {3, 4, 5, 400, 401, 700, 999}}) {
+        // What the type cannot tell is no case: before the stamp, unsigned; after 4.29 s; float ms.
+        const bool is_signed = c.datatype == kFloat32 || c.datatype == kFloat64;
+        const bool absolute = c.reference == TimeReference::kAbsolute;
+        if (!is_signed && !absolute && wrong < 0) continue;
+        if (c.datatype == kUint32 && c.count == 1 && wrong > 4 * s) continue;
+        SCOPED_TRACE(c.name + ", wrong by " + std::to_string(toSeconds(wrong)) + " s at " +
+                     std::to_string(which[0]));
+        Message message(kPoints, 1, 24);
+        message.xyz().field(c.field, kTimeOffset, c.datatype, c.count);
+        message.header.header_stamp = c.header_stamp;
+        for (std::size_t i = 0; i < kPoints; ++i) {
+          c.write(message, i, static_cast<StampNs>(i) * kStepNs);
+        }
+        const ReadCloud right = PointCloudReader(c.config).read(message.view());
+        for (const std::size_t i : which) c.write(message, i, wrong);
+        const ReadCloud read = PointCloudReader(c.config).read(message.view());
+        EXPECT_EQ(read.time.unit, right.time.unit);
+        EXPECT_EQ(read.time.reference, right.time.reference);
+        EXPECT_EQ(read.time.text, right.time.text);
+        EXPECT_EQ(read.counters.time_outliers, which.size());
+        std::vector<StampNs> expected;
+        for (std::size_t i = 0; i < kPoints; ++i) {
+          if (std::find(which.begin(), which.end(), i) == which.end()) {
+            expected.push_back(right.cloud.time_ns[i]);
+          }
+        }
+        // Where the first or the last point takes the stamp, another one may be the first or last.
+        const bool by_end = c.reference == TimeReference::kScanEnd || c.name == "another clock";
+        const StampNs shift = by_end && read.cloud.time_ns.size() == expected.size()
+                                  ? read.cloud.time_ns.back() - expected.back()
+                                  : 0;
+        EXPECT_LE(std::abs(shift), kStepNs);
+        for (StampNs& time : expected) time += shift;
+        EXPECT_EQ(read.cloud.time_ns, expected);
+      }
+    }
+  }
+}
+
+TEST(PointCloudReader, AScanThatIsTooShortOrTooLongIsSaidWithTheLikelyUnit) {
+  struct Case {
+    double per_second;  ///< what the driver's unit is
+    const char* word;
+  };
+  for (const Case& c :
+       {Case{1e6, "in us it would be 0.1 s"}, {1e3, "in ms it would be 0.1 s"}, {1e9, ""}}) {
+    Message message(kPoints, 1, 20);
+    message.xyz().field("t", 16, kUint32);
+    for (std::size_t i = 0; i < kPoints; ++i) {
+      message.set<std::uint32_t>(
+          i, 16, static_cast<std::uint32_t>(1e-4 * static_cast<double>(i) * c.per_second));
+    }
+    const ReadCloud read = PointCloudReader({}).read(message.view());
+    EXPECT_EQ(read.time.warning, *c.word != 0) << read.time.text;
+    EXPECT_NE(read.time.text.find(c.word), std::string::npos) << read.time.text;
+  }
+  Message message(kPoints, 1, 24);
+  message.xyz().field("t", 16, kFloat64);
+  for (std::size_t i = 0; i < kPoints; ++i) {
+    message.set<double>(i, 16, 100.0 * static_cast<double>(i));  // us
+  }
+  PointCloudReaderConfig config;
+  config.time_unit = TimeUnit::kMilliseconds;
+  const ReadCloud read = PointCloudReader(config).read(message.view());
+  EXPECT_TRUE(read.time.warning);
+  EXPECT_NE(read.time.text.find("more than lidar.longest_scan_s; in us"), std::string::npos)
+      << read.time.text;
+  EXPECT_GT(read.counters.time_outliers, kPoints / 2);
+  config.longest_scan_ns = 200 * kNsPerSecond;
+  EXPECT_EQ(PointCloudReader(config).read(message.view()).counters.time_outliers, 0u);
+}
+
 TEST(PointCloudReader, WithoutATimeFieldTheConfigurationDecides) {
   Message message(8, 1, 12);
   message.xyz();
@@ -391,6 +477,77 @@ TEST(PointCloudReader, AbsentFieldsHaveTheirStandardValues) {
   EXPECT_EQ(cloud.ring.at(0), kNoRing);
 }
 
+TEST(PointCloudReader, KnowsTheNamesOfManyDriversAndListsTheFieldsWhereNoneFits) {
+  for (const char* const ring : {"ring", "channel", "line", "layer", "laser_id", "laser_number"}) {
+    for (const char* const intensity : {"intensity", "i", "reflectivity", "intensities"}) {
+      Message message(2, 1, 20);
+      message.xyz().field(ring, 12, kUint16).field(intensity, 16, kFloat32);
+      message.set<std::uint16_t>(1, 12, 7);
+      message.set<float>(1, 16, 9.0f);
+      const ReadCloud read = PointCloudReader({}).read(message.view());
+      EXPECT_EQ(read.cloud.ring.at(1), 7) << ring;
+      EXPECT_EQ(read.cloud.intensity.at(1), 9.0f) << intensity;
+      EXPECT_TRUE(read.notes.empty());
+    }
+  }
+  Message message(2, 1, 20);
+  message.xyz().field("strahl", 12, kUint16).field("zeit", 16, kUint32);
+  const ReadCloud read = PointCloudReader({}).read(message.view());
+  ASSERT_EQ(read.notes.size(), 1u);
+  EXPECT_NE(read.notes[0].find("x, y, z, strahl, zeit"), std::string::npos) << read.notes[0];
+  EXPECT_NE(read.time.text.find("x, y, z, strahl, zeit"), std::string::npos) << read.time.text;
+}
+
+TEST(PointCloudReader, ARowStepThatCannotBeIsTakenFromTheData) {
+  Message message(3, 2, 12);
+  message.xyz();
+  for (std::size_t i = 0; i < 6; ++i) message.set<float>(i, 0, static_cast<float>(i));
+  for (const std::uint32_t row_step : {0u, 12u, 72u, 1000000u}) {
+    message.header.row_step = row_step;
+    const ReadCloud read = PointCloudReader({}).read(message.view());
+    EXPECT_EQ(read.cloud.x, (std::vector<float>{0, 1, 2, 3, 4, 5})) << row_step;
+    ASSERT_FALSE(read.notes.empty());
+    EXPECT_NE(read.notes[0].find("row_step"), std::string::npos);
+  }
+}
+
+TEST(PointCloudReader, BeamsWithoutAReturnDoNotComeOut) {
+  const float far = 1e6f;
+  for (const std::vector<float>& none :
+       {std::vector<float>{0, 0, 0}, {-1, -1, -1}, {0.3f, 0.1f, -0.2f}, {0, 0, far}}) {
+    Message message(1000, 4, 20);
+    message.xyz().field("t", 16, kUint32);
+    std::mt19937 random(5);
+    std::size_t without = 0;
+    for (std::size_t i = 0; i < 4000; ++i) {
+      const bool returned = random() % 3 != 0;
+      without += returned ? 0 : 1;
+      message.set<float>(i, 0, returned ? 3.0f + 1e-3f * static_cast<float>(i) : none[0]);
+      message.set<float>(i, 4, returned ? 1.0f : none[1]);
+      message.set<float>(i, 8, returned ? 2.0f : none[2]);
+      // What such beams have as their time must not matter.
+      message.set<std::uint32_t>(
+          i, 16, returned ? 1000000 + static_cast<std::uint32_t>(i) * 20000 : 4000000000u);
+    }
+    const ReadCloud read = PointCloudReader({}).read(message.view());
+    EXPECT_EQ(read.counters.no_return_points + read.counters.far_points, without);
+    EXPECT_EQ(read.counters.time_outliers, 0u);
+    EXPECT_EQ(read.cloud.size(), 4000 - without);
+    EXPECT_FALSE(read.time.warning) << read.time.text;
+  }
+}
+
+TEST(PointCloudReader, PointsBeyondEveryMeasurementAreDroppedAndCounted) {
+  Message message(4, 1, 12);
+  message.xyz();
+  message.set<float>(0, 0, 1e4f);
+  message.set<float>(1, 4, -1.1e4f);
+  message.set<float>(2, 8, 1e30f);
+  const ReadCloud read = PointCloudReader({}).read(message.view());
+  EXPECT_EQ(read.cloud.size(), 2u);
+  EXPECT_EQ(read.counters.far_points, 2u);
+}
+
 TEST(PointCloudReader, DropsAndCountsWhatIsNotFinite) {
   const float nan = std::numeric_limits<float>::quiet_NaN();
   const float inf = std::numeric_limits<float>::infinity();
@@ -421,12 +578,12 @@ TEST(PointCloudReader, DropsAndCountsWhatIsNotFinite) {
 TEST(PointCloudReader, RangeLimitsDropAndCount) {
   Message message(4, 1, 12);
   message.xyz();
-  for (std::size_t i = 0; i < 4; ++i) message.set<float>(i, 4, static_cast<float>(i));
+  for (std::size_t i = 0; i < 4; ++i) message.set<float>(i, 8, static_cast<float>(i) + 0.5f);
   PointCloudReaderConfig config;
-  config.min_range_m = 1.0;
-  config.max_range_m = 2.0;
+  config.min_range_m = 1.5;
+  config.max_range_m = 2.5;
   const ReadCloud read = PointCloudReader(config).read(message.view());
-  EXPECT_EQ(read.cloud.y, (std::vector<float>{1, 2}));
+  EXPECT_EQ(read.cloud.z, (std::vector<float>{1.5f, 2.5f}));
   EXPECT_EQ(read.counters.out_of_range_points, 2u);
 }
 
@@ -527,7 +684,10 @@ TEST(PointCloudReader, SurvivesRandomHeadersAndBytes) {
     try {
       const ReadCloud read = PointCloudReader(config).read(bytes);
       ++accepted;
-      ASSERT_EQ(read.cloud.size() + read.counters.non_finite_points, read.counters.points);
+      const PointCloudCounters& counters = read.counters;
+      ASSERT_EQ(read.cloud.size() + counters.non_finite_points + counters.no_return_points +
+                    counters.far_points + counters.time_outliers + counters.out_of_range_points,
+                counters.points);
       for (std::size_t i = 0; i < read.cloud.size(); ++i) {
         ASSERT_TRUE(std::isfinite(read.cloud.x[i]) && std::isfinite(read.cloud.intensity[i]));
         ASSERT_EQ(read.cloud.firings.at(read.cloud.firing[i]).begin_ns, read.cloud.time_ns[i]);

@@ -686,7 +686,7 @@ void cloudCases(std::vector<Case>* cases) {
 
 std::string decodedPackets(const std::function<void(std::vector<Packet>&)>& spoil,
                            const std::string& frame = "velodyne",
-                           std::optional<LidarModel> model = std::nullopt) {
+                           const LidarSpec* model = nullptr) {
   return said([&] {
     PacketEncoder::Config encoder_config;
     encoder_config.start_ns = 1546300800 * kNsPerSecond;

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: MIT
+"""fuse_bag on what lidars and their drivers send: times, stamps and points that are wrong."""
+import os
+import sys
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+bag_factory = pytest.importorskip("bag_factory")
+import rosbag  # noqa: E402
+from sensor_msgs.msg import PointField  # noqa: E402
+
+from bag_factory import START_NS, Drive, read_cloud, stamp  # noqa: E402
+from test_fuse_bag import Made  # noqa: E402
+
+SURFACE_M = 0.01  # right points lie on a surface; floats and odometry's interpolation cost less
+ABSOLUTE = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "timestamp"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<f8"],
+        "offsets": [0, 4, 8, 12, 16, 24],
+        "itemsize": 32,
+    }
+)
+
+
+def changed(folder, drive, change, rig_extra=""):
+    """A bag of the drive in which `change(message)` altered each message of the lidar."""
+    made = Made(folder, drive, rig_extra)
+    raw = folder / "raw.bag"
+    made.bag.rename(raw)
+    with rosbag.Bag(str(raw)) as source, rosbag.Bag(str(made.bag), "w") as target:
+        for topic, message, time in source.read_messages():
+            if topic in ("/points", "/velodyne_packets"):
+                change(message)
+            header = bag_factory.latching_header(topic, message) if topic == "/tf_static" else None
+            target.write(topic, message, time, connection_header=header)
+    return made
+
+
+def gaps(made, fused):
+    """For each semantic cloud the distance of its points to the nearest surface, m."""
+    result = []
+    for message in fused.of("/points_semantic"):
+        cloud = read_cloud(message)
+        T = made.drive.pose((message.header.stamp.to_nsec() - START_NS) * 1e-9)
+        T = T @ made.drive.lidar_pose
+        xyz = np.stack([cloud["x"], cloud["y"], cloud["z"]], -1).astype(float)
+        result.append(made.drive.surface_gap(xyz @ T[:3, :3].T + T[:3, 3]))
+    return result
+
+
+def absolute(message, unit=1e-9):
+    """The cloud with its times as f64 since the epoch; `unit` of the field's values, s."""
+    cloud = read_cloud(message)
+    times = np.zeros(len(cloud), ABSOLUTE)
+    for name in ABSOLUTE.names[:5]:
+        times[name] = cloud[name]
+    times["timestamp"] = (message.header.stamp.to_nsec() + cloud["t"].astype(float)) * 1e-9 / unit
+    kinds = {"<f4": 7, "<u2": 4, "<f8": 8}
+    message.fields = [
+        PointField(name, ABSOLUTE.fields[name][1], kinds[ABSOLUTE.fields[name][0].str], 1)
+        for name in ABSOLUTE.names
+    ]
+    message.point_step, message.row_step = 32, 32 * len(cloud)
+    return times
+
+
+def test_one_zero_timestamp_of_absolute_times(tmp_path):
+    def change(message):
+        cloud = absolute(message, unit=1.0)
+        cloud["timestamp"][100] = 0.0
+        message.data = cloud.tobytes()
+
+    made = changed(tmp_path, Drive(scans=2), change)
+    fused = made.fuse()
+    for gap in gaps(made, fused):
+        assert len(gap) == made.drive.points_per_scan - 1
+        assert gap.max() < SURFACE_M
+    assert "points with a time that is none of their scan's: 2" in fused.result.stdout
+
+
+def test_times_that_change_their_unit_are_said(tmp_path):
+    units = iter([1.0, 1e-9, 1.0])
+
+    def change(message):
+        message.data = absolute(message, unit=next(units)).tobytes()
+
+    made = changed(tmp_path, Drive(scans=3), change)
+    fused = made.fuse()
+    assert max(gap.max() for gap in gaps(made, fused)) < SURFACE_M
+    assert "read otherwise than those of the scan before" in fused.result.stderr
+
+
+def test_beams_without_a_return(tmp_path):
+    def change(message):
+        cloud = read_cloud(message).copy()
+        none = np.random.RandomState(0).rand(len(cloud)) < 0.3
+        for axis in "xyz":
+            cloud[axis][none] = 0.0
+        message.data = cloud.tobytes()
+
+    made = changed(tmp_path, Drive(scans=2), change)
+    fused = made.fuse()
+    for gap in gaps(made, fused):
+        assert 0.6 * made.drive.points_per_scan < len(gap) < 0.8 * made.drive.points_per_scan
+        assert gap.max() < SURFACE_M
+    assert "points without a return" in fused.result.stdout
+
+
+def test_a_packet_of_another_hour(tmp_path):
+    def change(message):
+        early = message.packets[40].stamp.to_nsec() - 3600 * 10**9
+        message.packets[40].stamp = stamp(early)
+
+    made = changed(tmp_path, Drive(scans=2, lidar="packets"), change)
+    fused = made.fuse()
+    for gap in gaps(made, fused):
+        assert gap.max() < SURFACE_M
+    assert "packets stamped far from the others of their scan: 2" in fused.result.stdout
+
+
+def test_packets_of_one_stamp(tmp_path):
+    def change(message):
+        for packet in message.packets:
+            packet.stamp = message.packets[0].stamp
+
+    made = changed(tmp_path, Drive(scans=2, lidar="packets"), change)
+    fused = made.fuse()
+    assert max(gap.max() for gap in gaps(made, fused)) < SURFACE_M
+    assert "all packets of a scan carry one stamp" in fused.result.stderr
