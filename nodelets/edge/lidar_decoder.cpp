@@ -125,6 +125,7 @@ TimedCloud LidarDecoder::decode(const sensor_msgs::PointCloud2& message) {
   count_drops_("points beyond lidar.largest_coordinate_m", read.counters.far_points);
   count_drops_("points with a time that is none of their scan's", read.counters.time_outliers);
   for (const std::string& text : read.notes) note(text, false);
+  for (const std::string& text : read.warnings) note(text, true);
   if (!read.cloud.empty()) noteTimes(read.time);
   return std::move(read.cloud);
 }

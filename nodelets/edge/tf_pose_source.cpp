@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <cinttypes>
+#include <cmath>
 #include <cstdio>
 #include <limits>
 #include <utility>
@@ -22,12 +23,53 @@ constexpr std::size_t kMaxUnread = 1000000;
 constexpr std::size_t kMaxPendingOdometry = 100000;
 /// Deeper trees are loops.
 constexpr std::size_t kMaxDepth = 1000;
+/// tf2 seeks in a list from its newest transform on: what is older than the newest by more than
+/// this (two clocks, a bag from its end) is kept and looked up here.
+constexpr StampNs kOrderlyNs = 5 * kNsPerSecond;
+constexpr std::size_t kMostNotes = 100;
 
 std::string seconds(StampNs stamp) {
   char text[40];
   std::snprintf(text, sizeof(text), "%" PRId64 ".%09" PRId64, stamp / kNsPerSecond,
                 std::abs(stamp % kNsPerSecond));
   return text;
+}
+
+/// "(1.000, 0.000, 0.500) m, yaw 2.9 deg", for messages.
+std::string valueText(const Transform& T) {
+  const Eigen::Vector3d p = T.translation();
+  char text[200];
+  std::snprintf(text, sizeof(text), "(%.3f, %.3f, %.3f) m turned by %.2f deg", p.x(), p.y(), p.z(),
+                Eigen::AngleAxisd(T.linear()).angle() * 180.0 / kPi);
+  return text;
+}
+
+/// Farther apart than what rounding to float or to text does.
+bool differ(const Transform& a, const Transform& b) {
+  return (a.translation() - b.translation()).norm() > 1e-3 ||
+         Eigen::Quaterniond(a.linear()).angularDistance(Eigen::Quaterniond(b.linear())) > 1e-3;
+}
+
+void checkPlace(const Eigen::Vector3d& translation, double largest_m) {
+  if (translation.cwiseAbs().maxCoeff() <= largest_m) return;
+  char text[120];
+  std::snprintf(text, sizeof(text),
+                "translation of %.3g m; at most %.3g "
+                "(odometry.largest_coordinate_m) are taken",
+                translation.cwiseAbs().maxCoeff(), largest_m);
+  throw DataError(text);
+}
+
+/// Of one moving edge at a time that its transforms cover.
+std::optional<Transform> poseOf(const std::map<StampNs, Transform>& poses, StampNs stamp) {
+  const auto after = poses.lower_bound(stamp);
+  if (after == poses.end()) return std::nullopt;
+  if (after->first == stamp) return after->second;
+  if (after == poses.begin()) return std::nullopt;
+  const auto before = std::prev(after);
+  return interpolate(before->second, after->second,
+                     static_cast<double>(stamp - before->first) /
+                         static_cast<double>(after->first - before->first));
 }
 
 ros::Duration cacheLength(StampNs history_ns) {
@@ -43,38 +85,97 @@ TfPoseSourceConfig tfPoseSourceConfig(const Rig& rig, StampNs history_ns) {
   config.source = rig.odometry.source;
   config.time_offset_ns = toNs(rig.odometry.time_offset_s);
   config.history_ns = history_ns;
+  config.largest_coordinate_m = rig.odometry.largest_coordinate_m;
+  config.fastest_mps = rig.odometry.fastest_mps;
   return config;
 }
 
 TfPoseSource::TfPoseSource(TfPoseSourceConfig config)
     : config_(std::move(config)),
       buffer_(std::make_unique<tf2::BufferCore>(cacheLength(config_.history_ns))),
-      odometry_(config_.history_ns) {
+      odometry_(config_.history_ns, config_.fastest_mps) {
   config_.fixed_frame = frameName(config_.fixed_frame);
   config_.vehicle_frame = frameName(config_.vehicle_frame);
 }
 
+bool TfPoseSource::refuse(const std::string& child, const std::string& what,
+                          const std::string& reason) {
+  ++counters_.rejected;
+  problem_ = what + " is refused: " + reason;
+  note("refused " + child, problem_);
+  return false;
+}
+
+void TfPoseSource::note(const std::string& key, const std::string& text) const {
+  if (noted_.size() < kMostNotes && noted_.insert(key).second) notes_.push_back(text);
+}
+
+std::vector<std::string> TfPoseSource::takeNotes() {
+  std::vector<std::string> notes;
+  notes.swap(notes_);
+  return notes;
+}
+
+/// Tells of a static edge that comes with another value, or as a moving one. False if the message
+/// must not count: /tf_static tells an edge that /tf tells otherwise.
+bool TfPoseSource::noteStaticValues(const geometry_msgs::TransformStamped& message, bool is_static,
+                                    const Transform& T_parent_child) {
+  const auto known = edges_.find(message.child_frame_id);
+  if (known == edges_.end()) return true;
+  Edge& edge = known->second;
+  const std::string name = message.header.frame_id + " <- " + message.child_frame_id;
+  if (edge.parent != message.header.frame_id) {
+    note("parent " + message.child_frame_id, "frame " + message.child_frame_id +
+                                                 " has two parents, " + edge.parent + " and " +
+                                                 message.header.frame_id + ": the last one counts");
+    return true;
+  }
+  if (edge.is_static != is_static) {
+    const std::string both = edge.is_static ? valueText(edge.latest) + " on /tf_static and " +
+                                                  valueText(T_parent_child) + " on /tf"
+                                            : valueText(edge.latest) + " on /tf and " +
+                                                  valueText(T_parent_child) + " on /tf_static";
+    const bool other = differ(edge.latest, T_parent_child);
+    if (other || !edge.is_static) {
+      note("twice " + name, name + " comes both as " + both + ": " +
+                                (edge.is_static ? "/tf_static counts" : "/tf counts"));
+    }
+    if (edge.is_static) return false;
+  } else if (is_static && differ(edge.latest, T_parent_child)) {
+    note("static " + name, name + " comes on /tf_static as " + valueText(edge.latest) + " and as " +
+                               valueText(T_parent_child) + ": the last one counts");
+  }
+  return true;
+}
+
 bool TfPoseSource::add(const geometry_msgs::TransformStamped& message, bool is_static) {
   ++counters_.transforms;
+  problem_.clear();
   geometry_msgs::TransformStamped clean = message;
   clean.header.frame_id = frameName(message.header.frame_id);
   clean.child_frame_id = frameName(message.child_frame_id);
   const std::string& child = clean.child_frame_id;
   const std::string& parent = clean.header.frame_id;
+  const std::string name = "transform " + parent + " <- " + child;
   const StampNs stamp = stampNs(message.header.stamp);
+  Transform T_parent_child;
   try {
-    const Transform T_parent_child = transform(message.transform);
+    T_parent_child = transform(message.transform);
+    checkPlace(T_parent_child.translation(), config_.largest_coordinate_m);
     const Eigen::Quaterniond rotation(T_parent_child.linear());
     clean.transform.rotation.w = rotation.w();
     clean.transform.rotation.x = rotation.x();
     clean.transform.rotation.y = rotation.y();
     clean.transform.rotation.z = rotation.z();
-  } catch (const DataError&) {
-    ++counters_.rejected;
-    return false;
+  } catch (const DataError& e) {
+    return refuse(child, name, e.what());
   }
-  if (child.empty() || parent.empty() || child == parent || (!is_static && stamp == 0)) {
-    ++counters_.rejected;
+  if (parent.empty()) return refuse(child, name, "header.frame_id is empty");
+  if (child.empty()) return refuse(child, name, "child_frame_id is empty");
+  if (child == parent) return refuse(child, name, "a frame cannot hang below itself");
+  if (!is_static && stamp == 0) return refuse(child, name, "its stamp is 0");
+  if (!noteStaticValues(clean, is_static, T_parent_child)) {
+    ++counters_.repeated;
     return false;
   }
   const auto known = edges_.find(child);
@@ -83,27 +184,38 @@ bool TfPoseSource::add(const geometry_msgs::TransformStamped& message, bool is_s
     ++counters_.repeated;
     return false;
   }
+  const bool late =
+      known != edges_.end() && !is_static && stamp + kOrderlyNs < known->second.newest;
+  if (late && config_.history_ns > 0 && stamp + config_.history_ns < known->second.newest) {
+    return refuse(child, name, "it is older than what is kept; do two clocks stamp it?");
+  }
   try {
-    if (!buffer_->setTransform(clean, "", is_static)) {
-      ++counters_.rejected;
-      return false;
+    if (!late && !buffer_->setTransform(clean, "", is_static)) {
+      return refuse(child, name, "tf2 takes it for too old or malformed");
     }
-  } catch (const std::exception&) {  // a stamp beyond what ros::Time can add up
-    ++counters_.rejected;
-    return false;
+  } catch (const std::exception& e) {  // a stamp beyond what ros::Time can add up
+    return refuse(child, name, e.what());
   }
 
   Edge& edge = edges_[child];
   if (known == edges_.end() || edge.parent != parent) {
     edge.parent = parent;
     edge.is_static = is_static;
+    edge.first = T_parent_child;
+    edge.poses.clear();
     chain_is_known_ = false;
   }
+  edge.latest = T_parent_child;
+  edge.changed = edge.changed || differ(edge.first, edge.latest);
   if (is_static) return true;
   edge.newest = std::max(edge.newest, stamp);
   const bool off_chain =
       chain_is_known_ && std::find(moving_.begin(), moving_.end(), child) == moving_.end();
   if (config_.source == OdometrySource::kTf && !off_chain) {
+    edge.poses[stamp] = T_parent_child;
+    while (config_.history_ns > 0 && edge.poses.begin()->first < edge.newest - config_.history_ns) {
+      edge.poses.erase(edge.poses.begin());
+    }
     edge.unread.push_back(stamp);
     if (edge.unread.size() > kMaxUnread) edge.unread.pop_front();
     // At once: tf2 gives its newest transform exactly, an older one after an interpolation that
@@ -115,16 +227,15 @@ bool TfPoseSource::add(const geometry_msgs::TransformStamped& message, bool is_s
 
 bool TfPoseSource::add(const nav_msgs::Odometry& message) {
   ++counters_.odometry;
-  if (message.header.stamp.isZero()) {
-    ++counters_.rejected;
-    return false;
-  }
+  problem_.clear();
+  const std::string name = "odometry of " + frameName(message.child_frame_id);
+  if (message.header.stamp.isZero()) return refuse("odometry", name, "its stamp is 0");
   try {
-    transform(message.pose.pose);
-  } catch (const DataError&) {
-    ++counters_.rejected;
-    return false;
+    checkPlace(transform(message.pose.pose).translation(), config_.largest_coordinate_m);
+  } catch (const DataError& e) {
+    return refuse("odometry", name, e.what());
   }
+  noteTwist(message);
   pending_.push_back(message);
   if (pending_.size() > kMaxPendingOdometry) pending_.pop_front();
   counters_.odometry_pending = pending_.size();
@@ -136,35 +247,143 @@ bool TfPoseSource::isOdometry(const geometry_msgs::TransformStamped& message) {
                                         frameName(message.child_frame_id)) != moving_.end();
 }
 
+/// Compares how far the poses and the twists of the messages go, second by second: a pose that is
+/// frozen, or of another unit or vehicle than the twist.
+void TfPoseSource::noteTwist(const nav_msgs::Odometry& message) {
+  const StampNs stamp = stampNs(message.header.stamp);
+  const auto& v = message.twist.twist.linear;
+  const double speed_mps = std::sqrt(v.x * v.x + v.y * v.y + v.z * v.z);
+  const auto& p = message.pose.pose.position;
+  const Eigen::Vector3d at(p.x, p.y, p.z);
+  auto& way = travelled_;
+  const bool joined = stamp > way.end && stamp - way.end < kNsPerSecond / 2;
+  if (!joined || !std::isfinite(speed_mps)) {
+    way = {stamp, stamp, at, 0.0};
+    return;
+  }
+  way.by_twist_m += speed_mps * toSeconds(stamp - way.end);
+  way.end = stamp;
+  if (way.end - way.begin < kNsPerSecond) return;
+  const double by_pose_m = (at - way.from).norm();
+  // Drivers without a twist leave it 0.
+  if (way.by_twist_m > 1.0 &&
+      (by_pose_m < 0.5 * way.by_twist_m || by_pose_m > 2.0 * way.by_twist_m)) {
+    char text[200];
+    std::snprintf(
+        text, sizeof(text),
+        "odometry: within a second its pose moves by %.2f m and its twist says %.2f m: is "
+        "the pose frozen, or of another unit?",
+        by_pose_m, way.by_twist_m);
+    note("twist", text);
+  }
+  way = {stamp, stamp, at, 0.0};
+}
+
 void TfPoseSource::clear() {
   buffer_->clear();  // static transforms survive
   for (auto& edge : edges_) {
     edge.second.newest = 0;
     edge.second.unread.clear();
+    edge.second.poses.clear();
   }
   wanted_.clear();
+  late_.clear();
+  travelled_ = {};
   pending_.clear();
   counters_.odometry_pending = 0;
-  odometry_ = PoseBuffer(config_.history_ns);
+  odometry_ = PoseBuffer(config_.history_ns, config_.fastest_mps);
   chain_is_known_ = false;
 }
 
 TransformAnswer TfPoseSource::extrinsics(const std::string& target,
                                          const std::string& source) const {
+  noteChangingExtrinsics(frameName(target), frameName(source));
   return lookup(frameName(target), frameName(source), ros::Time(0));
 }
 
-const PoseBuffer& TfPoseSource::odometry() {
+/// Extrinsics are taken as fixed; a moving edge between the two frames that changed says otherwise.
+void TfPoseSource::noteChangingExtrinsics(const std::string& target,
+                                          const std::string& source) const {
+  const std::vector<std::string> a = ancestors(target), b = ancestors(source);
+  const auto shared = [](const std::string& frame, const std::vector<std::string>& others) {
+    return std::find(others.begin(), others.end(), frame) != others.end();
+  };
+  for (const std::vector<std::string>& side : {a, b}) {
+    for (const std::string& frame : side) {
+      if (shared(frame, a) && shared(frame, b)) break;
+      const auto edge = edges_.find(frame);
+      const bool in_chain = std::find(moving_.begin(), moving_.end(), frame) != moving_.end();
+      if (edge == edges_.end() || edge->second.is_static || in_chain) continue;
+      if (!edge->second.changed) continue;
+      note("changing " + frame, edge->second.parent + " <- " + frame + " changes, from " +
+                                    valueText(edge->second.first) + " to " +
+                                    valueText(edge->second.latest) +
+                                    ": between sensors and vehicle the latest value counts for all "
+                                    "times");
+    }
+  }
+}
+
+void TfPoseSource::read() {
   if (config_.source == OdometrySource::kTf) {
     readTf();
   } else {
     readPendingOdometry();
   }
+}
+
+const PoseBuffer& TfPoseSource::odometry() {
+  read();
+  if (!late_.empty()) odometry_.add(late_);
+  late_.clear();
+  for (const StampNs stamp : odometry_.jumps()) {
+    note("jump", jumpText(stamp));
+    break;
+  }
   return odometry_;
+}
+
+void TfPoseSource::addReading(const StampedPose& reading) {
+  if (odometry_.empty() || reading.stamp > odometry_.readings().back().stamp) {
+    odometry_.add(reading);
+  } else {
+    late_.push_back(reading);
+  }
+}
+
+/// Of the jump to the reading at `stamp`.
+std::string TfPoseSource::jumpText(StampNs stamp) const {
+  const auto& readings = odometry_.readings();
+  const auto to =
+      std::lower_bound(readings.begin(), readings.end(), stamp,
+                       [](const StampedPose& reading, StampNs t) { return reading.stamp < t; });
+  const StampedPose& a = *std::prev(to);
+  char text[300];
+  std::snprintf(
+      text, sizeof(text),
+      "the pose of %s in %s jumps by %.2f m and %.1f deg within %.3f s at %s: nothing is "
+      "interpolated there, and points beyond it get status 4 (odometry.fastest_mps). Do two nodes "
+      "publish it, or has a localisation found its place again?",
+      config_.vehicle_frame.substr(0, 60).c_str(), config_.fixed_frame.substr(0, 60).c_str(),
+      (to->T_fixed_vehicle.translation() - a.T_fixed_vehicle.translation()).norm(),
+      Eigen::Quaterniond(a.T_fixed_vehicle.linear())
+              .angularDistance(Eigen::Quaterniond(to->T_fixed_vehicle.linear())) *
+          180.0 / kPi,
+      toSeconds(to->stamp - a.stamp), seconds(a.stamp).c_str());
+  return text;
 }
 
 std::string TfPoseSource::gap(StampNs from_ns, StampNs to_ns) {
   const PoseBuffer& poses = odometry();
+  const std::vector<StampNs>& jumps = poses.jumps();
+  const auto jump = std::upper_bound(jumps.begin(), jumps.end(), std::min(from_ns, to_ns));
+  if (jump != jumps.end() && std::prev(poses.readings().end())->stamp >= *jump) {
+    const auto& readings = poses.readings();
+    const auto behind =
+        std::lower_bound(readings.begin(), readings.end(), *jump,
+                         [](const StampedPose& reading, StampNs t) { return reading.stamp < t; });
+    if (std::prev(behind)->stamp < std::max(from_ns, to_ns)) return jumpText(*jump);
+  }
   if (poses.covers(from_ns) && poses.covers(to_ns)) return {};
   const std::string name = config_.source == OdometrySource::kTf
                                ? "tf " + config_.fixed_frame + " <- " + config_.vehicle_frame
@@ -212,17 +431,45 @@ TransformAnswer TfPoseSource::lookup(const std::string& target, const std::strin
   return answer;
 }
 
+/// A frame and those above it.
+std::vector<std::string> TfPoseSource::ancestors(const std::string& frame) const {
+  std::vector<std::string> chain{frame};
+  for (auto edge = edges_.find(frame); edge != edges_.end() && chain.size() <= kMaxDepth;
+       edge = edges_.find(chain.back())) {
+    chain.push_back(edge->second.parent);
+  }
+  return chain;
+}
+
+/// T_fixed_vehicle at a time that all moving edges of the chain cover, without tf2.
+std::optional<Transform> TfPoseSource::poseFromEdges(StampNs stamp) const {
+  const std::vector<std::string> of_fixed = ancestors(config_.fixed_frame);
+  const std::vector<std::string> of_vehicle = ancestors(config_.vehicle_frame);
+  const auto joint =
+      std::find_first_of(of_vehicle.begin(), of_vehicle.end(), of_fixed.begin(), of_fixed.end());
+  if (joint == of_vehicle.end()) return std::nullopt;
+  // T_joint_frame, up from `frame`.
+  const auto below = [&](const std::vector<std::string>& frames) -> std::optional<Transform> {
+    Transform T_here_frame = Transform::Identity();
+    for (const std::string& frame : frames) {
+      if (frame == *joint) break;
+      const Edge& edge = edges_.at(frame);
+      const std::optional<Transform> T_parent_here =
+          edge.is_static ? edge.latest : poseOf(edge.poses, stamp);
+      if (!T_parent_here) return std::nullopt;
+      T_here_frame = *T_parent_here * T_here_frame;
+    }
+    return T_here_frame;
+  };
+  const std::optional<Transform> T_joint_fixed = below(of_fixed);
+  const std::optional<Transform> T_joint_vehicle = below(of_vehicle);
+  if (!T_joint_fixed || !T_joint_vehicle) return std::nullopt;
+  return T_joint_fixed->inverse(Eigen::Isometry) * *T_joint_vehicle;
+}
+
 /// Finds the moving edges between the fixed frame and the vehicle; false if they are not joined.
 bool TfPoseSource::findMovingEdges() {
   if (chain_is_known_) return true;
-  const auto ancestors = [this](const std::string& frame) {
-    std::vector<std::string> chain{frame};
-    for (auto edge = edges_.find(frame); edge != edges_.end() && chain.size() <= kMaxDepth;
-         edge = edges_.find(chain.back())) {
-      chain.push_back(edge->second.parent);
-    }
-    return chain;
-  };
   const std::vector<std::string> of_fixed = ancestors(config_.fixed_frame);
   const std::vector<std::string> of_vehicle = ancestors(config_.vehicle_frame);
   const auto joint =
@@ -239,6 +486,7 @@ bool TfPoseSource::findMovingEdges() {
   for (auto& edge : edges_) {
     if (std::find(moving_.begin(), moving_.end(), edge.first) == moving_.end()) {
       edge.second.unread.clear();
+      edge.second.poses.clear();
     }
   }
   chain_is_known_ = true;
@@ -261,22 +509,27 @@ void TfPoseSource::readTf() {
     return;
   }
   if (stands_still_) {
-    odometry_ = PoseBuffer(config_.history_ns);
+    odometry_ = PoseBuffer(config_.history_ns, config_.fastest_mps);
     stands_still_ = false;
   }
   StampNs reached = std::numeric_limits<StampNs>::max();
+  StampNs newest = 0;
   for (const std::string& child : moving_) {
     Edge& edge = edges_.at(child);
     wanted_.insert(edge.unread.begin(), edge.unread.end());
     edge.unread.clear();
     reached = std::min(reached, edge.newest);
+    newest = std::max(newest, edge.newest);
   }
   while (!wanted_.empty() && *wanted_.begin() <= reached) {
     const StampNs stamp = *wanted_.begin();
     wanted_.erase(wanted_.begin());
     // A stamp before the first transform of another edge has no pose, now or later.
-    const TransformAnswer pose = lookup(config_.fixed_frame, config_.vehicle_frame, rosTime(stamp));
-    if (pose) odometry_.add({stamp + config_.time_offset_ns, *pose.transform});
+    const std::optional<Transform> pose =
+        stamp + kOrderlyNs < newest
+            ? poseFromEdges(stamp)
+            : lookup(config_.fixed_frame, config_.vehicle_frame, rosTime(stamp)).transform;
+    if (pose) addReading({stamp + config_.time_offset_ns, *pose});
   }
 }
 
@@ -290,8 +543,8 @@ void TfPoseSource::readPendingOdometry() {
       if (!answer) break;
       T_child_vehicle = *answer.transform;
     }
-    odometry_.add({stampNs(message.header.stamp) + config_.time_offset_ns,
-                   transform(message.pose.pose) * T_child_vehicle});
+    addReading({stampNs(message.header.stamp) + config_.time_offset_ns,
+                transform(message.pose.pose) * T_child_vehicle});
     pending_.pop_front();
   }
   counters_.odometry_pending = pending_.size();

@@ -47,17 +47,20 @@ struct TfPoseSourceConfig {
   std::string fixed_frame = "odom";
   std::string vehicle_frame = "base_link";
   OdometrySource source = OdometrySource::kTf;
-  StampNs time_offset_ns = 0;  ///< of the odometry: true time = stamp + this
-  StampNs history_ns = 0;      ///< how long readings and transforms are kept; 0 = for good
+  StampNs time_offset_ns = 0;         ///< of the odometry: true time = stamp + this
+  StampNs history_ns = 0;             ///< how long readings and transforms are kept; 0 = for good
+  double largest_coordinate_m = 1e8;  ///< larger translations are refused
+  double fastest_mps = 100.0;         ///< faster steps are jumps; see PoseBuffer
 };
 
 TfPoseSourceConfig tfPoseSourceConfig(const Rig& rig, StampNs history_ns);
 
 struct TfPoseSourceCounters {
   std::uint64_t transforms = 0;
-  std::uint64_t rejected = 0;          ///< not finite, not a rotation, stamp 0, empty frame
-  std::uint64_t repeated = 0;          ///< a second transform of one edge and stamp
-  std::uint64_t odometry = 0;          ///< nav_msgs/Odometry
+  std::uint64_t rejected = 0;  ///< not finite, not a rotation, too far, stamp 0, empty frame,
+                               ///< a moving transform of what /tf_static tells
+  std::uint64_t repeated = 0;  ///< a second transform of one edge and stamp
+  std::uint64_t odometry = 0;  ///< nav_msgs/Odometry
   std::uint64_t odometry_pending = 0;  ///< waiting for the transform from its child frame
 };
 
@@ -65,7 +68,7 @@ class TfPoseSource {
  public:
   explicit TfPoseSource(TfPoseSourceConfig config);
 
-  /// False if the transform is unusable (counted) or known already.
+  /// False if the transform is unusable (counted, see problem()) or known already.
   bool add(const geometry_msgs::TransformStamped& message, bool is_static);
   /// The pose of `child_frame_id` (empty: the vehicle) in `header.frame_id`, for source `topic`.
   /// False if unusable.
@@ -74,6 +77,11 @@ class TfPoseSource {
   bool isOdometry(const geometry_msgs::TransformStamped& message);
   /// Counts a reading that was not added.
   void countRejected() { ++counters_.rejected; }
+  /// Why the last `add` was refused; empty if it was not.
+  const std::string& problem() const { return problem_; }
+  /// What a user should know of the transforms (refused ones, two values of one that is static,
+  /// jumps of the pose), as far as it was not told before: each once.
+  std::vector<std::string> takeNotes();
   /// Forgets what moves, keeps static transforms and counters (a clock jump).
   void clear();
 
@@ -83,6 +91,8 @@ class TfPoseSource {
 
   /// T_fixed_vehicle over time, with all that was added.
   const PoseBuffer& odometry();
+  /// What odometry() does, but for sorting in what came late.
+  void read();
 
   /// Why odometry does not cover `from_ns`..`to_ns` (true time), in words; empty if it does.
   std::string gap(StampNs from_ns, StampNs to_ns);
@@ -94,11 +104,25 @@ class TfPoseSource {
     std::string parent;
     bool is_static = false;
     StampNs newest = 0;
-    std::deque<StampNs> unread;  ///< stamps whose pose is not in `odometry_` yet
+    std::deque<StampNs> unread;                ///< stamps whose pose is not in `odometry_` yet
+    Transform first = Transform::Identity();   ///< of a static edge, or the first of a moving one
+    Transform latest = Transform::Identity();  ///< in order of arrival
+    bool changed = false;                      ///< `latest` ever differed from `first`
+    std::map<StampNs, Transform> poses;        ///< of a moving edge of the chain
   };
 
   TransformAnswer lookup(const std::string& target, const std::string& source,
                          const ros::Time& time) const;
+  bool refuse(const std::string& child, const std::string& what, const std::string& reason);
+  void note(const std::string& key, const std::string& text) const;
+  bool noteStaticValues(const geometry_msgs::TransformStamped& message, bool is_static,
+                        const Transform& T_parent_child);
+  void noteChangingExtrinsics(const std::string& target, const std::string& source) const;
+  std::vector<std::string> ancestors(const std::string& frame) const;
+  std::optional<Transform> poseFromEdges(StampNs stamp) const;
+  std::string jumpText(StampNs stamp) const;
+  void addReading(const StampedPose& reading);
+  void noteTwist(const nav_msgs::Odometry& message);
   bool findMovingEdges();
   void readTf();
   void readPendingOdometry();
@@ -113,6 +137,16 @@ class TfPoseSource {
   std::set<StampNs> wanted_;   ///< raw stamps to look up
   std::deque<nav_msgs::Odometry> pending_;  ///< without T_child_vehicle so far
   PoseBuffer odometry_;
+  std::vector<StampedPose> late_;  ///< readings before the newest, to be sorted in
+  std::string problem_;
+  mutable std::set<std::string> noted_;     ///< keys of what was told
+  mutable std::vector<std::string> notes_;  ///< that were not taken
+  /// What the poses and the twists of nav_msgs/Odometry say since a message.
+  struct {
+    StampNs begin = 0, end = 0;
+    Eigen::Vector3d from = Eigen::Vector3d::Zero();
+    double by_twist_m = 0.0;
+  } travelled_;
 };
 
 }  // namespace semantic_lidar_fusion

@@ -46,6 +46,7 @@ class TfSubscription {
           boost::function<void(const nav_msgs::OdometryConstPtr&)>(
               [this](const nav_msgs::OdometryConstPtr& message) {
                 observe(message->header.stamp, [this, message] { source_.add(*message); });
+                reportNotes();
               }),
           ros::VoidConstPtr(), hints);
     }
@@ -54,6 +55,11 @@ class TfSubscription {
   TfPoseSource& source() { return source_; }
 
  private:
+  /// What is said of transforms and odometry, each line once.
+  void reportNotes() {
+    for (const std::string& note : source_.takeNotes()) ROS_WARN_STREAM("tf: " << note);
+  }
+
   void add(const tf2_msgs::TFMessage& message, bool is_static) {
     for (const auto& transform : message.transforms) {
       if (is_static || !source_.isOdometry(transform)) {
@@ -62,6 +68,7 @@ class TfSubscription {
         observe(transform.header.stamp, [this, transform] { source_.add(transform, false); });
       }
     }
+    reportNotes();
   }
 
   /// Adds a reading of the odometry, at once or when its epoch is clear.

@@ -328,6 +328,8 @@ OdometryConfig readOdometry(YamlSection section) {
                                      {"hold", OnMissingOdometry::kHold},
                                      {"extrapolate", OnMissingOdometry::kExtrapolate}});
   section.number("max_extrapolation", &odometry.max_extrapolation_s, {0, 10});
+  section.number("largest_coordinate_m", &odometry.largest_coordinate_m, {1, 1e12});
+  section.number("fastest_mps", &odometry.fastest_mps, {0});
   section.number("timeout", &odometry.timeout_s, kWait);
   section.finish();
   return odometry;

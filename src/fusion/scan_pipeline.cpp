@@ -194,7 +194,7 @@ CameraView ScanPipeline::view(std::size_t index, const CameraPlace& place,
   if (!rig_.motion_enabled || view.image_ns == reference_ns) return view;
 
   const std::optional<Transform> T_vehicle_image_vehicle_reference =
-      vehicleMotion(odometry, reference_ns, view.image_ns);
+      vehicleMotion(odometry, reference_ns, view.image_ns, rig_.compensationConfig());
   if (!T_vehicle_lidar || !T_vehicle_image_vehicle_reference) {
     view.has_image = false;
     return view;

@@ -353,6 +353,7 @@ class ScanWriter {
     const LidarSpec& spec = known.spec();
     const int blocks_per_slot = spec.blocksPerSlot(known.dual);
     const StampNs start = startOf(known);
+    cloud_.packet_begin_ns.push_back(start);
     for (int s = 0; s < known.slotCount(); ++s) {
       const Slot& slot = known.slots[s];
       if (!slot.valid) continue;

@@ -143,13 +143,13 @@ struct Field {
 std::uint64_t checkLayout(const PointCloudBytes& bytes) {
   const std::uint64_t used_row = std::uint64_t{bytes.width} * bytes.point_step;
   if (bytes.is_bigendian) refuse("is_bigendian is true, only little-endian data can be read");
-  if (!bytes.data) refuse("data is missing");
-  if (bytes.row_step >= used_row && std::uint64_t{bytes.row_step} * bytes.height == bytes.size) {
-    return bytes.row_step;
-  }
-  if (used_row <= std::numeric_limits<std::uint64_t>::max() / bytes.height &&
-      used_row * bytes.height == bytes.size) {
-    return used_row;
+  const bool as_told =
+      bytes.row_step >= used_row && std::uint64_t{bytes.row_step} * bytes.height == bytes.size;
+  const bool as_needed = used_row <= std::numeric_limits<std::uint64_t>::max() / bytes.height &&
+                         used_row * bytes.height == bytes.size;
+  if (as_told || as_needed) {
+    if (!bytes.data) refuse("data is missing");
+    return as_told ? bytes.row_step : used_row;
   }
   if (bytes.row_step < used_row) {
     refuse("row_step is " + std::to_string(bytes.row_step) + ", must be at least width " +

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <deque>
 #include <limits>
 #include <unordered_map>
 #include <utility>
@@ -152,6 +153,32 @@ double angleBetween(const Transform& a, const Transform& b) {
   return Eigen::Quaterniond(a.linear()).angularDistance(Eigen::Quaterniond(b.linear()));
 }
 
+/// The readings that belong together with the pose at t_ref.
+class Readings {
+ public:
+  Readings(const PoseBuffer& odometry, StampNs around_ns)
+      : all_(odometry.readings()), stretch_(odometry.stretchAround(around_ns)) {}
+
+  std::size_t size() const { return stretch_.end - stretch_.begin; }
+  bool empty() const { return size() == 0; }
+  const StampedPose& operator[](std::size_t i) const { return all_[stretch_.begin + i]; }
+  const StampedPose& front() const { return (*this)[0]; }
+  const StampedPose& back() const { return (*this)[size() - 1]; }
+  /// The first one at or after `t`; size() if there is none.
+  std::size_t atOrAfter(StampNs t) const {
+    const auto first = all_.begin() + static_cast<std::ptrdiff_t>(stretch_.begin);
+    const auto end = all_.begin() + static_cast<std::ptrdiff_t>(stretch_.end);
+    const auto found = std::lower_bound(
+        first, end, t,
+        [](const StampedPose& reading, StampNs time) { return reading.stamp < time; });
+    return static_cast<std::size_t>(found - first);
+  }
+
+ private:
+  const std::deque<StampedPose>& all_;
+  PoseBuffer::Stretch stretch_;
+};
+
 /// What becomes of a firing's points.
 enum class Fate : std::uint8_t { kMove, kMark, kDrop };
 
@@ -165,7 +192,14 @@ struct Plan {
 };
 
 /// For each firing the time of its packet's first firing.
-std::vector<StampNs> packetTimes(const std::vector<Firing>& firings) {
+std::vector<StampNs> packetTimes(const std::vector<Firing>& firings,
+                                 const std::vector<StampNs>& packet_begin_ns) {
+  if (!packet_begin_ns.empty()) {
+    std::vector<StampNs> times;
+    times.reserve(firings.size());
+    for (const Firing& firing : firings) times.push_back(packet_begin_ns.at(firing.packet));
+    return times;
+  }
   std::unordered_map<std::uint32_t, StampNs> first_of_packet;
   for (const Firing& firing : firings) {
     const auto entry = first_of_packet.emplace(firing.packet, firing.begin_ns).first;
@@ -177,9 +211,8 @@ std::vector<StampNs> packetTimes(const std::vector<Firing>& firings) {
   return times;
 }
 
-Fate fateOfUncovered(StampNs begin_ns, StampNs end_ns, const PoseBuffer& odometry,
+Fate fateOfUncovered(StampNs begin_ns, StampNs end_ns, const Readings& readings,
                      const CompensationConfig& config) {
-  const auto& readings = odometry.readings();
   switch (config.on_missing) {
     case OnMissingOdometry::kDrop:
       return Fate::kDrop;
@@ -197,70 +230,83 @@ Fate fateOfUncovered(StampNs begin_ns, StampNs end_ns, const PoseBuffer& odometr
   return Fate::kMark;
 }
 
-Plan makePlan(const std::vector<Firing>& firings, const PoseBuffer& odometry,
-              bool reference_covered, const CompensationConfig& config) {
+Plan makePlan(const TimedCloud& scan, const Readings& readings, bool reference_covered,
+              const CompensationConfig& config) {
+  const std::vector<Firing>& firings = scan.firings;
   Plan plan;
   const bool by_packet = config.granularity == MotionGranularity::kPacket;
-  if (by_packet) plan.packet_times = packetTimes(firings);
+  if (by_packet) plan.packet_times = packetTimes(firings, scan.packet_begin_ns);
   plan.fates.assign(firings.size(), Fate::kMove);
   plan.uncovered.assign(firings.size(), false);
-  const auto& readings = odometry.readings();
   const StampNs covered_from = readings.empty() ? 1 : readings.front().stamp;
   const StampNs covered_to = readings.empty() ? 0 : readings.back().stamp;
   for (std::size_t k = 0; k < firings.size(); ++k) {
     const StampNs begin = by_packet ? plan.packet_times[k] : firings[k].begin_ns;
-    const StampNs end = firings[k].end_ns;
+    const StampNs end = by_packet ? begin : firings[k].end_ns;
     if (begin < covered_from || end > covered_to) {
       plan.uncovered[k] = true;
       ++plan.uncovered_count;
-      plan.fates[k] = fateOfUncovered(begin, end, odometry, config);
+      plan.fates[k] = fateOfUncovered(begin, end, readings, config);
     }
     // Without the pose at t_ref no firing has one relative to it, whatever becomes of single ones.
     if (!reference_covered) plan.fates[k] = Fate::kMark;
     if (plan.fates[k] != Fate::kMove) continue;
     plan.first_ns = std::min(plan.first_ns, begin);
-    plan.last_ns = std::max(plan.last_ns, by_packet ? begin : end);
+    plan.last_ns = std::max(plan.last_ns, end);
   }
   return plan;
 }
 
-Track makeTrack(const PoseBuffer& odometry, const Transform& T_fixed_vehicle_ref,
+/// The pose at a time outside of the readings: that of the nearest one, or, with two readings and
+/// kExtrapolate, at the constant twist of the nearest two.
+class Outside {
+ public:
+  Outside(const Readings& readings, bool before, const CompensationConfig& config)
+      : edge_(before ? readings.front() : readings.back()),
+        twist_(config.on_missing == OnMissingOdometry::kExtrapolate && readings.size() >= 2) {
+    if (!twist_) return;
+    const StampedPose& inner = before ? readings[1] : readings[readings.size() - 2];
+    step_ = relative(inner.T_fixed_vehicle, edge_.T_fixed_vehicle);
+    step_ns_ = static_cast<double>(edge_.stamp - inner.stamp);  // negative before
+    angle_ = angleBetween(inner.T_fixed_vehicle, edge_.T_fixed_vehicle);
+  }
+
+  Transform at(StampNs t) const {
+    if (!twist_) return edge_.T_fixed_vehicle;
+    return edge_.T_fixed_vehicle * screw(step_, static_cast<double>(t - edge_.stamp) / step_ns_);
+  }
+
+  void addTo(Track* track, StampNs begin, StampNs end) const {
+    if (!twist_) {
+      track->addStill(edge_.T_fixed_vehicle, begin, end);
+      return;
+    }
+    const double angle = angle_ * static_cast<double>(end - begin) / std::abs(step_ns_);
+    track->addMoving([this](StampNs t) -> Transform { return at(t); }, angle, begin, end);
+  }
+
+ private:
+  const StampedPose& edge_;
+  bool twist_;
+  Transform step_ = Transform::Identity();
+  double step_ns_ = 1.0;
+  double angle_ = 0.0;
+};
+
+Track makeTrack(const Readings& readings, const Transform& T_fixed_vehicle_ref,
                 const Transform& T_vehicle_lidar, const CompensationConfig& config,
                 const Plan& plan) {
   const StampNs first = plan.first_ns;
   const StampNs last = plan.last_ns;
   Track track(T_fixed_vehicle_ref, T_vehicle_lidar);
-  const auto& readings = odometry.readings();
-  const bool twist = config.on_missing == OnMissingOdometry::kExtrapolate && readings.size() >= 2;
-
-  const auto addOutside = [&](const StampedPose& edge, const StampedPose& inner, StampNs begin,
-                              StampNs end) {
-    if (!twist) {
-      track.addStill(edge.T_fixed_vehicle, begin, end);
-      return;
-    }
-    const Transform step = relative(inner.T_fixed_vehicle, edge.T_fixed_vehicle);
-    const double step_ns = static_cast<double>(edge.stamp - inner.stamp);  // negative before
-    const double angle = angleBetween(inner.T_fixed_vehicle, edge.T_fixed_vehicle) *
-                         static_cast<double>(end - begin) / std::abs(step_ns);
-    track.addMoving(
-        [&](StampNs t) -> Transform {
-          return edge.T_fixed_vehicle * screw(step, static_cast<double>(t - edge.stamp) / step_ns);
-        },
-        angle, begin, end);
-  };
-
   const StampedPose& front = readings.front();
   const StampedPose& back = readings.back();
   if (first < front.stamp) {
-    addOutside(front, twist ? readings[1] : front, first, std::min(last, front.stamp));
+    Outside(readings, true, config).addTo(&track, first, std::min(last, front.stamp));
   }
   // From the last reading before the first time on.
-  const auto from =
-      std::lower_bound(readings.begin(), readings.end(), first,
-                       [](const StampedPose& reading, StampNs t) { return reading.stamp < t; });
-  const std::size_t start =
-      from == readings.begin() ? 0 : static_cast<std::size_t>(from - readings.begin()) - 1;
+  const std::size_t from = readings.atOrAfter(first);
+  const std::size_t start = from == 0 ? 0 : from - 1;
   if (config.lookup == OdometryLookup::kClosest) {
     for (std::size_t i = start; i < readings.size(); ++i) {
       // Half-way belongs to the earlier reading.
@@ -297,8 +343,7 @@ Track makeTrack(const PoseBuffer& odometry, const Transform& T_fixed_vehicle_ref
     }
   }
   if (last > back.stamp) {
-    addOutside(back, twist ? readings[readings.size() - 2] : back, std::max(first, back.stamp),
-               last);
+    Outside(readings, false, config).addTo(&track, std::max(first, back.stamp), last);
   }
   return track;
 }
@@ -436,6 +481,17 @@ Cloud asMeasured(TimedCloud* scan, StampNs reference_ns) {
   return cloud;
 }
 
+/// The pose at `t`, which need not be the time of a point: interpolated, or as `on_missing` has it.
+std::optional<Transform> poseAt(const PoseBuffer& odometry, StampNs t,
+                                const CompensationConfig& config) {
+  if (const std::optional<Transform> pose = odometry.lookup(t)) return pose;
+  const Readings readings(odometry, t);
+  if (readings.empty() || fateOfUncovered(t, t, readings, config) != Fate::kMove) {
+    return std::nullopt;
+  }
+  return Outside(readings, t < readings.front().stamp, config).at(t);
+}
+
 }  // namespace
 
 CompensationResult compensate(TimedCloud scan, StampNs reference_ns, const PoseBuffer& odometry,
@@ -444,13 +500,14 @@ CompensationResult compensate(TimedCloud scan, StampNs reference_ns, const PoseB
   result.cloud = asMeasured(&scan, reference_ns);
   if (!config.enabled || result.cloud.empty()) return result;
 
-  const std::optional<Transform> T_fixed_vehicle_ref = odometry.lookup(reference_ns);
+  const std::optional<Transform> T_fixed_vehicle_ref = poseAt(odometry, reference_ns, config);
   result.counters.reference_covered = T_fixed_vehicle_ref.has_value();
 
-  const Plan plan = makePlan(scan.firings, odometry, result.counters.reference_covered, config);
+  const Readings readings(odometry, reference_ns);
+  const Plan plan = makePlan(scan, readings, result.counters.reference_covered, config);
   result.counters.uncovered_firings = plan.uncovered_count;
   if (plan.first_ns <= plan.last_ns) {
-    Track track = makeTrack(odometry, *T_fixed_vehicle_ref, T_vehicle_lidar, config, plan);
+    Track track = makeTrack(readings, *T_fixed_vehicle_ref, T_vehicle_lidar, config, plan);
     moveAll(scan.time_ns, scan.firing, plan, &track, &result.cloud);
   }
   if (plan.uncovered_count > 0 || !result.counters.reference_covered) {
@@ -460,9 +517,11 @@ CompensationResult compensate(TimedCloud scan, StampNs reference_ns, const PoseB
   return result;
 }
 
-std::optional<Transform> vehicleMotion(const PoseBuffer& odometry, StampNs from_ns, StampNs to_ns) {
-  const std::optional<Transform> T_fixed_from = odometry.lookup(from_ns);
-  const std::optional<Transform> T_fixed_to = odometry.lookup(to_ns);
+std::optional<Transform> vehicleMotion(const PoseBuffer& odometry, StampNs from_ns, StampNs to_ns,
+                                       const CompensationConfig& config) {
+  if (!(odometry.stretchAround(from_ns) == odometry.stretchAround(to_ns))) return std::nullopt;
+  const std::optional<Transform> T_fixed_from = poseAt(odometry, from_ns, config);
+  const std::optional<Transform> T_fixed_to = poseAt(odometry, to_ns, config);
   if (!T_fixed_from || !T_fixed_to) return std::nullopt;
   return relative(*T_fixed_to, *T_fixed_from);
 }

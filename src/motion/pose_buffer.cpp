@@ -10,6 +10,12 @@ namespace semantic_lidar_fusion {
 namespace {
 
 constexpr double kRotationTolerance = 1e-3;
+/// What noise and small corrections of an odometry add to a step, however short it is.
+constexpr double kSlackM = 0.2, kSlackRad = 0.2;
+constexpr double kFastestTurnRadS = 20.0;
+/// A vehicle does not go this far and back again between three readings.
+constexpr double kToAndFroM = 0.1;
+constexpr StampNs kToAndFroNs = 500000000;
 
 bool isBefore(const StampedPose& reading, StampNs t) { return reading.stamp < t; }
 
@@ -50,19 +56,95 @@ Transform interpolate(const Transform& a, const Transform& b, double fraction) {
 void PoseBuffer::add(const StampedPose& reading) {
   check(reading);
   const auto place = std::lower_bound(readings_.begin(), readings_.end(), reading.stamp, isBefore);
+  const auto index = static_cast<std::size_t>(place - readings_.begin());
   if (place != readings_.end() && place->stamp == reading.stamp) {
     *place = reading;
   } else {
     readings_.insert(place, reading);
   }
-  if (history_ns_ > 0) {
-    const StampNs oldest = readings_.back().stamp - history_ns_;
-    while (readings_.front().stamp < oldest) readings_.pop_front();
+  // A reading has a part in the steps to it, from it, and over it.
+  findJumps(index, index + 2);
+  forgetOld();
+}
+
+void PoseBuffer::add(const std::vector<StampedPose>& readings) {
+  for (const StampedPose& reading : readings) check(reading);
+  const auto earlier = [](const StampedPose& a, const StampedPose& b) { return a.stamp < b.stamp; };
+  readings_.insert(readings_.end(), readings.begin(), readings.end());
+  std::stable_sort(readings_.begin(), readings_.end(), earlier);
+  // Of one stamp the last one counts.
+  std::size_t kept = 0;
+  for (std::size_t i = 0; i < readings_.size(); ++i) {
+    const bool replaced = i + 1 < readings_.size() && readings_[i + 1].stamp == readings_[i].stamp;
+    if (!replaced) readings_[kept++] = readings_[i];
+  }
+  readings_.resize(kept);
+  jumps_.clear();
+  findJumps(0, readings_.size());
+  forgetOld();
+}
+
+void PoseBuffer::forgetOld() {
+  if (history_ns_ <= 0 || readings_.empty()) return;
+  const StampNs oldest = readings_.back().stamp - history_ns_;
+  while (readings_.front().stamp < oldest) readings_.pop_front();
+  jumps_.erase(jumps_.begin(),
+               std::upper_bound(jumps_.begin(), jumps_.end(), readings_.front().stamp));
+}
+
+/// Whether the step to reading `to` is a jump.
+bool PoseBuffer::isJump(std::size_t to) const {
+  if (fastest_mps_ <= 0.0 || to == 0 || to >= readings_.size()) return false;
+  const StampedPose& a = readings_[to - 1];
+  const StampedPose& b = readings_[to];
+  const double dt_s = toSeconds(b.stamp - a.stamp);
+  const double step_m = (b.T_fixed_vehicle.translation() - a.T_fixed_vehicle.translation()).norm();
+  if (step_m > kSlackM + fastest_mps_ * dt_s) return true;
+  const double turn_rad = Eigen::Quaterniond(a.T_fixed_vehicle.linear())
+                              .angularDistance(Eigen::Quaterniond(b.T_fixed_vehicle.linear()));
+  if (turn_rad > kSlackRad + kFastestTurnRadS * dt_s) return true;
+  if (to < 2 || b.stamp - readings_[to - 2].stamp > kToAndFroNs) return false;
+  const double both_m =
+      (b.T_fixed_vehicle.translation() - readings_[to - 2].T_fixed_vehicle.translation()).norm();
+  return step_m > kToAndFroM + 3.0 * both_m;
+}
+
+/// Judges the steps to the readings from .. to, at most the last one.
+void PoseBuffer::findJumps(std::size_t from, std::size_t to) {
+  for (std::size_t i = from; i <= to && i < readings_.size(); ++i) {
+    const StampNs stamp = readings_[i].stamp;
+    const auto place = std::lower_bound(jumps_.begin(), jumps_.end(), stamp);
+    const bool known = place != jumps_.end() && *place == stamp;
+    if (isJump(i) && !known) {
+      jumps_.insert(place, stamp);
+    } else if (known && !isJump(i)) {
+      jumps_.erase(place);
+    }
   }
 }
 
+PoseBuffer::Stretch PoseBuffer::stretchAround(StampNs t) const {
+  if (readings_.empty()) return {};
+  const auto after = atOrAfter(readings_, t);
+  auto nearest = after == readings_.end() ? std::prev(after) : after;
+  if (nearest != readings_.begin() && nearest->stamp > t &&
+      t - std::prev(nearest)->stamp <= nearest->stamp - t) {
+    --nearest;
+  }
+  const auto next = std::upper_bound(jumps_.begin(), jumps_.end(), nearest->stamp);
+  const auto indexOf = [&](StampNs stamp) {
+    return static_cast<std::size_t>(atOrAfter(readings_, stamp) - readings_.begin());
+  };
+  Stretch stretch{0, readings_.size()};
+  if (next != jumps_.begin()) stretch.begin = indexOf(*std::prev(next));
+  if (next != jumps_.end()) stretch.end = indexOf(*next);
+  return stretch;
+}
+
 bool PoseBuffer::covers(StampNs t) const {
-  return !readings_.empty() && readings_.front().stamp <= t && t <= readings_.back().stamp;
+  if (readings_.empty() || t < readings_.front().stamp || t > readings_.back().stamp) return false;
+  const auto after = atOrAfter(readings_, t);
+  return after->stamp == t || !std::binary_search(jumps_.begin(), jumps_.end(), after->stamp);
 }
 
 std::optional<Transform> PoseBuffer::lookup(StampNs t) const {

@@ -437,4 +437,5 @@ class RandomDrive:
         ranges = np.linalg.norm(xyz.astype(float), axis=1)
         kept = [i for i in np.flatnonzero(~lost) if within_limits(ranges[i], self.rig["lidar"])]
         xyz64 = xyz[kept].astype(float)
-        return Scan(xyz64, intensity[kept], ring[kept], true[kept], true[kept], true[kept])
+        begins = {int(t): int(t) for t in true[kept]}
+        return Scan(xyz64, intensity[kept], ring[kept], true[kept], true[kept], true[kept], begins)

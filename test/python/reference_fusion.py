@@ -65,6 +65,7 @@ class Scan:
     time_ns: np.ndarray
     firing: np.ndarray
     packet: np.ndarray
+    packet_begin_ns: Dict[int, int]  # of its first firing, whether it returned anything or not
 
     @property
     def first_ns(self) -> int:
@@ -86,12 +87,13 @@ def decode_packets(packets: List[Tuple[int, bytes]], name: str, config: Dict[str
     lasers, firings = len(lidar.elevation_deg), lidar.firings_per_block
     ring_of = np.argsort(np.argsort(lidar.elevation_deg))
     heights = config.get("vertical_offsets_m") or [0.0] * lasers
-    rows = []
+    rows, begins = [], {}
     for number, (stamp, data) in enumerate(sorted(set(packets))):
         blocks = 2 if data[1204] == 0x39 else 1  # that tell the same firings
         slots, slot_ns = 12 // blocks, firings * lidar.firing_ns
         early = {"start": 0, "middle": slots * slot_ns // 2, "end": slots * slot_ns}
         start = stamp + offset_ns - early[config.get("packet_stamp", "start")]
+        begins[number] = start
         azimuths = [struct.unpack_from("<H", data, 100 * s * blocks + 2)[0] for s in range(slots)]
         for s in range(slots):
             if s + 1 < slots:  # the last one keeps the difference before
@@ -120,7 +122,7 @@ def decode_packets(packets: List[Tuple[int, bytes]], name: str, config: Dict[str
                     firing = (number * slots + s) * firings + f
                     rows.append((xyz, intensity, ring_of[laser], time, firing, number))
     xyz, intensity, ring, time, firing, packet = zip(*rows)
-    return Scan(*map(np.array, (xyz, intensity, ring, time, firing, packet)))
+    return Scan(*map(np.array, (xyz, intensity, ring, time, firing, packet)), begins)
 
 
 class Odometry:
@@ -149,6 +151,12 @@ class Odometry:
         """Of two the earlier."""
         return self.poses[int(np.argmin(np.abs(self.times - t)))]
 
+    def pose(self, t: int, on_missing: str) -> Optional[np.ndarray]:
+        """Of t_ref and of an image."""
+        if self.covers(t):
+            return self.at(t)
+        return self.nearest(t) if on_missing == "hold" else None
+
 
 def between(T_fixed_a: np.ndarray, T_fixed_b: np.ndarray) -> np.ndarray:
     """T_a_b, without losing digits to large coordinates."""
@@ -170,17 +178,17 @@ def compensate(
     status, comes_out = np.zeros(n, int), np.ones(n, bool)
     if not rig["motion"]["enabled"]:
         return xyz, status, comes_out
-    if not odometry.covers(t_ref):
+    pose_ref = odometry.pose(t_ref, rig["odometry"]["on_missing"])
+    if pose_ref is None:
         return xyz, np.full(n, NO_ODOMETRY), comes_out
     T_lidar_vehicle, config = np.linalg.inv(T_vehicle_lidar), rig["odometry"]
     by_packet = rig["motion"]["granularity"] == "packet"
-    begin_of_packet = {p: int(scan.time_ns[scan.packet == p].min()) for p in set(scan.packet)}
     for firing in np.unique(scan.firing):
         members = np.flatnonzero(scan.firing == firing)
         ends = (int(scan.time_ns[members].min()), int(scan.time_ns[members].max()))
-        covered = all(odometry.covers(t) for t in ends)
         if by_packet:
-            covered &= odometry.covers(begin_of_packet[scan.packet[members[0]]])
+            ends = (scan.packet_begin_ns[scan.packet[members[0]]],)
+        covered = all(odometry.covers(t) for t in ends)
         if not covered and config["on_missing"] == "mark":
             status[members] = NO_ODOMETRY
             continue
@@ -188,12 +196,12 @@ def compensate(
             comes_out[members] = False
             continue
         for i in members:
-            t = begin_of_packet[scan.packet[i]] if by_packet else int(scan.time_ns[i])
+            t = scan.packet_begin_ns[scan.packet[i]] if by_packet else int(scan.time_ns[i])
             if config["lookup"] == "closest" or not odometry.covers(t):
                 pose = odometry.nearest(t)
             else:
                 pose = odometry.at(t)
-            T = T_lidar_vehicle @ between(odometry.at(t_ref), pose) @ T_vehicle_lidar
+            T = T_lidar_vehicle @ between(pose_ref, pose) @ T_vehicle_lidar
             xyz[i] = moved(T, scan.xyz[i])
     return xyz, status, comes_out
 

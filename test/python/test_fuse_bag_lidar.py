@@ -12,7 +12,7 @@ import rosbag  # noqa: E402
 from sensor_msgs.msg import PointField  # noqa: E402
 
 from bag_factory import START_NS, Drive, read_cloud, stamp  # noqa: E402
-from test_fuse_bag import Made  # noqa: E402
+from test_fuse_bag import Made, run  # noqa: E402
 
 SURFACE_M = 0.01  # right points lie on a surface; floats and odometry's interpolation cost less
 ABSOLUTE = np.dtype(
@@ -130,3 +130,62 @@ def test_packets_of_one_stamp(tmp_path):
     fused = made.fuse()
     assert max(gap.max() for gap in gaps(made, fused)) < SURFACE_M
     assert "all packets of a scan carry one stamp" in fused.result.stderr
+
+
+def changed_tf(folder, change, drive=None):
+    """A bag of a drive in which `change(message)` altered each message on /tf."""
+    made = Made(folder, drive or Drive(scans=2))
+    raw = folder / "raw.bag"
+    made.bag.rename(raw)
+    with rosbag.Bag(str(raw)) as source, rosbag.Bag(str(made.bag), "w") as target:
+        for topic, message, time in source.read_messages():
+            if topic == "/tf":
+                change(message)
+            header = bag_factory.latching_header(topic, message) if topic == "/tf_static" else None
+            target.write(topic, message, time, connection_header=header)
+    return made
+
+
+def test_a_jump_of_the_pose(tmp_path):
+    def change(message):
+        if message.transforms[0].header.stamp.to_nsec() >= START_NS + 155_000_000:
+            message.transforms[0].transform.translation.x += 10.0
+
+    made = changed_tf(tmp_path, change)
+    fused = made.fuse()
+    gap = gaps(made, fused)[0]
+    status = fused.clouds()[0]["status"]
+    assert gap[status == 0].max() < SURFACE_M
+    # The scan ends at 0.2 s; t_ref is 0.15 s, and the last reading before the jump is there.
+    assert 0.4 < (status == 4).mean() < 0.6
+    assert "jumps by 10.0" in fused.result.stderr
+    assert "firings: odometry does not cover them" in fused.result.stdout
+
+
+def test_a_static_transform_told_twice(tmp_path):
+    drive = Drive(scans=2)
+
+    def change(message):
+        higher = drive.lidar_pose.copy()
+        higher[2, 3] += 0.5
+        stamp_ns = message.transforms[0].header.stamp.to_nsec()
+        message.transforms.append(
+            bag_factory.transform_message("base_link", "velodyne", stamp_ns, higher)
+        )
+
+    made = changed_tf(tmp_path, change, drive)
+    fused = made.fuse()
+    assert max(gap.max() for gap in gaps(made, fused)) < SURFACE_M
+    (line,) = [x for x in fused.result.stderr.splitlines() if "base_link <- velodyne" in x]
+    assert "(1.000, 0.000, 0.500)" in line and "(1.000, 0.000, 1.000)" in line
+
+
+def test_a_refused_transform_says_why(tmp_path):
+    def change(message):
+        rotation = message.transforms[0].transform.rotation
+        for axis in "xyzw":
+            setattr(rotation, axis, 1.02 * getattr(rotation, axis))
+
+    made = changed_tf(tmp_path, change)
+    result = run(made.bag, made.folder / "out.bag", "--rig", made.rig)
+    assert "odom <- base_link" in result.stderr and "1.02" in result.stderr

@@ -146,9 +146,12 @@ class Expected:
         T, t_image = T_camera_vehicle @ drive.T_vehicle_lidar, stamp + camera.offset_ns
         has_image = stamp != 0
         if has_image and drive.rig["motion"]["enabled"] and t_image != self.t_ref:
-            has_image = odometry.covers(t_image) and odometry.covers(self.t_ref)
+            on_missing = drive.rig["odometry"]["on_missing"]
+            at_image = odometry.pose(t_image, on_missing)
+            at_reference = odometry.pose(self.t_ref, on_missing)
+            has_image = at_image is not None and at_reference is not None
             if has_image:
-                ego = reference.between(odometry.at(t_image), odometry.at(self.t_ref))
+                ego = reference.between(at_image, at_reference)
                 T = T_camera_vehicle @ ego @ drive.T_vehicle_lidar
         seen = reference.project(camera.info, camera.config, reference.moved(T, self.xyz))
         seen.valid &= ~self.unmoved

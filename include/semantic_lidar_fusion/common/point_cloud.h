@@ -30,6 +30,9 @@ struct TimedCloud {
   std::vector<StampNs> time_ns;       ///< true time of each point
   std::vector<std::uint32_t> firing;  ///< index into `firings`
   std::vector<Firing> firings;
+  /// True time of each packet's first firing, whether it returned anything or not, by
+  /// Firing::packet; empty for clouds without packets.
+  std::vector<StampNs> packet_begin_ns;
 
   std::size_t size() const { return x.size(); }
   bool empty() const { return x.empty(); }

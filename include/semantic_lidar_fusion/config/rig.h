@@ -78,8 +78,10 @@ struct OdometryConfig {
   double time_offset_s = 0.0;  ///< key time_offset
   OdometryLookup lookup = OdometryLookup::kInterpolate;
   OnMissingOdometry on_missing = OnMissingOdometry::kMark;
-  double max_extrapolation_s = 0.1;  ///< key max_extrapolation
-  double timeout_s = 0.1;            ///< key timeout
+  double max_extrapolation_s = 0.1;   ///< key max_extrapolation
+  double timeout_s = 0.1;             ///< key timeout
+  double largest_coordinate_m = 1e8;  ///< of any pose and transform; beyond it they are refused
+  double fastest_mps = 100.0;  ///< faster steps are jumps, and not interpolated; 0 = no limit
 };
 
 struct ReferenceConfig {

@@ -90,7 +90,8 @@ struct ReadCloud {
   TimedCloud cloud;  ///< one firing for each distinct time
   TimeDecision time;
   PointCloudCounters counters;
-  std::vector<std::string> notes;  ///< what else a user should know of the layout, one line each
+  std::vector<std::string> notes;     ///< what else a user should know of the layout, a line each
+  std::vector<std::string> warnings;  ///< what is wrong with it and was read nevertheless
 };
 
 class PointCloudReader {

@@ -124,7 +124,11 @@ void BagFusion::measureScans() {
   }
   counts_points_ = false;
   for (const LidarDecoder::Note& note : lidar_.takeNotes()) {
-    if (note.warning) DropLog::warn("lidar: " + note.text);
+    if (note.warning) {
+      DropLog::warn("lidar: " + note.text);
+    } else if (note.text != lidar_.timeDecision()) {  // which the summary tells
+      DropLog::note("lidar: " + note.text);
+    }
   }
 }
 

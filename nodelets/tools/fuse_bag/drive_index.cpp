@@ -157,9 +157,9 @@ class Router {
     }
     handlers_[topic].push_back([this](const rosbag::MessageInstance& m) {
       if (!poses_->add(*instantiate<nav_msgs::Odometry>(m))) {
-        drops_->count("odometry: unusable", m.getTopic() + ": unusable message is dropped");
+        drops_->add("odometry: unusable", 1);  // its note says why
       }
-      poses_->odometry();
+      poses_->read();
     });
   }
 
@@ -170,12 +170,10 @@ class Router {
     for (const auto& transform : message->transforms) {
       const std::uint64_t repeated = poses_->counters().repeated;
       if (!poses_->add(transform, is_static) && poses_->counters().repeated == repeated) {
-        drops_->count("tf: unusable transforms",
-                      m.getTopic() + ": transform " + transform.header.frame_id + " <- " +
-                          transform.child_frame_id + " is unusable and dropped");
+        drops_->add("tf: unusable transforms", 1);  // its note says why
       }
     }
-    poses_->odometry();  // reads near the end of tf's buffer: its search is linear
+    poses_->read();  // near the end of tf's buffer: its search is linear
   }
 
  private:
@@ -225,6 +223,8 @@ DriveIndex indexDrive(const BagInput& input, const Rig& rig, TfPoseSource* poses
     progress.update(++done);
     checkpoint();
   }
+  poses->odometry();
+  for (const std::string& note : poses->takeNotes()) DropLog::warn("tf: " + note);
   return index;
 }
 

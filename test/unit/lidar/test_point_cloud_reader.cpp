@@ -506,8 +506,8 @@ TEST(PointCloudReader, ARowStepThatCannotBeIsTakenFromTheData) {
     message.header.row_step = row_step;
     const ReadCloud read = PointCloudReader({}).read(message.view());
     EXPECT_EQ(read.cloud.x, (std::vector<float>{0, 1, 2, 3, 4, 5})) << row_step;
-    ASSERT_FALSE(read.notes.empty());
-    EXPECT_NE(read.notes[0].find("row_step"), std::string::npos);
+    ASSERT_EQ(read.warnings.size(), 1u);
+    EXPECT_NE(read.warnings[0].find("row_step"), std::string::npos);
   }
 }
 

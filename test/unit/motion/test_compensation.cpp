@@ -298,8 +298,8 @@ TEST(Compensation, AnEmptyScanGivesAnEmptyCloudStampedWithItsHeader) {
 TEST(Compensation, WithoutThePoseAtTheReferenceEveryPointIsMarked) {
   const Motion motion = constantTwist();
   const Drive drive = makeDrive(motion, lidarOnVehicle());
-  for (const auto mode : {OnMissingOdometry::kMark, OnMissingOdometry::kHold,
-                          OnMissingOdometry::kExtrapolate, OnMissingOdometry::kDrop}) {
+  for (const auto mode :
+       {OnMissingOdometry::kMark, OnMissingOdometry::kExtrapolate, OnMissingOdometry::kDrop}) {
     CompensationConfig config;
     config.on_missing = mode;
     const CompensationResult result =
@@ -506,6 +506,123 @@ TEST(VehicleMotion, IsTheTransformBetweenTwoTimesAlsoInMapCoordinates) {
   EXPECT_LT((T_to_from->matrix() - expected.matrix()).cwiseAbs().maxCoeff(), 2e-9);
   EXPECT_FALSE(vehicleMotion(odometry, from, kAfter + kNsPerSecond));
   EXPECT_FALSE(vehicleMotion(odometry, kStart - 1, to));
+}
+
+TEST_F(PartlyCovered, HoldAndExtrapolateReachTheReferenceAndTheImageToo) {
+  const StampNs behind = last_reading + 600000;
+  drive.reference = behind;
+  const Transform T_ref_fixed = (motion(behind) * lidarOnVehicle()).inverse();
+  const CompensationResult extrapolated = run(OnMissingOdometry::kExtrapolate);
+  EXPECT_TRUE(extrapolated.counters.reference_covered);
+  EXPECT_EQ(extrapolated.counters.marked_points, 0u);
+  for (std::size_t i = 0; i < drive.scan.size(); i += 7) {
+    const Eigen::Vector3d point(drive.scan.x[i], drive.scan.y[i], drive.scan.z[i]);
+    const Eigen::Vector3d truth =
+        T_ref_fixed * motion(drive.scan.time_ns[i]) * lidarOnVehicle() * point;
+    ASSERT_LT((at(extrapolated.cloud, i) - truth).norm(), 0.5e-3);
+  }
+  EXPECT_TRUE(run(OnMissingOdometry::kHold).counters.reference_covered);
+  EXPECT_FALSE(run(OnMissingOdometry::kMark).counters.reference_covered);
+  EXPECT_FALSE(run(OnMissingOdometry::kExtrapolate, 500000).counters.reference_covered);
+
+  CompensationConfig config;
+  const StampNs from = kStart + 50000000;
+  EXPECT_FALSE(vehicleMotion(odometry, from, behind, config));
+  config.on_missing = OnMissingOdometry::kExtrapolate;
+  const auto moved = vehicleMotion(odometry, from, behind, config);
+  ASSERT_TRUE(moved);
+  EXPECT_LT(
+      (moved->matrix() - (motion(behind).inverse() * motion(from)).matrix()).cwiseAbs().maxCoeff(),
+      1e-4);
+  config.on_missing = OnMissingOdometry::kHold;
+  const auto held = vehicleMotion(odometry, from, behind, config);
+  ASSERT_TRUE(held);
+  EXPECT_LT((held->matrix() - (motion(last_reading).inverse() * motion(from)).matrix())
+                .cwiseAbs()
+                .maxCoeff(),
+            1e-4);
+}
+
+TEST(Compensation, APacketHasThePoseOfItsFirstFiringWhateverReturned) {
+  const Motion motion = constantTwist();
+  Drive drive = makeDrive(motion, lidarOnVehicle());
+  for (int p = 0; p < kPackets; ++p) {
+    drive.scan.packet_begin_ns.push_back(kStart + p * kFiringsPerPacket * kFiringNs);
+  }
+  const PoseBuffer odometry = odometryOf(motion, kBefore, kAfter);
+  CompensationConfig config;
+  config.granularity = MotionGranularity::kPacket;
+  const CompensationResult whole =
+      compensate(drive.scan, drive.reference, odometry, lidarOnVehicle(), config);
+
+  // The first half of every packet returns nothing.
+  TimedCloud half;
+  half.packet_begin_ns = drive.scan.packet_begin_ns;
+  std::vector<std::size_t> kept;
+  for (std::size_t i = 0; i < drive.scan.size(); ++i) {
+    if (drive.scan.firing[i] % kFiringsPerPacket < kFiringsPerPacket / 2) continue;
+    kept.push_back(i);
+    half.x.push_back(drive.scan.x[i]);
+    half.y.push_back(drive.scan.y[i]);
+    half.z.push_back(drive.scan.z[i]);
+    half.intensity.push_back(drive.scan.intensity[i]);
+    half.ring.push_back(drive.scan.ring[i]);
+    half.time_ns.push_back(drive.scan.time_ns[i]);
+    half.firing.push_back(drive.scan.firing[i]);
+  }
+  half.firings = drive.scan.firings;
+  const CompensationResult result =
+      compensate(half, drive.reference, odometry, lidarOnVehicle(), config);
+  for (std::size_t k = 0; k < kept.size(); ++k) {
+    ASSERT_EQ(at(result.cloud, k), at(whole.cloud, kept[k]));
+  }
+
+  // Odometry that ends within the last packet still knows its first firing.
+  const StampNs last_packet = drive.scan.packet_begin_ns.back();
+  PoseBuffer ends = odometryOf(motion, kBefore, last_packet);
+  ends.add({last_packet + 1000, motion(last_packet + 1000)});
+  const CompensationResult ended =
+      compensate(drive.scan, drive.reference, ends, lidarOnVehicle(), config);
+  EXPECT_EQ(ended.counters.marked_points, 0u);
+}
+
+TEST(Compensation, NothingIsInterpolatedAcrossAJumpOfThePose) {
+  const Motion motion = constantTwist();
+  const Drive drive = makeDrive(motion, lidarOnVehicle());
+  const StampNs jump = kBefore + 9 * kReadingNs;  // the first reading behind it
+  for (const StampNs reference : {jump - 15000000, jump + 5000000}) {
+    PoseBuffer odometry(0, 100.0);
+    for (StampNs t = kBefore; t <= kAfter; t += kReadingNs) {
+      Transform T = motion(t);
+      if (t >= jump) T.translation().x() += 10.0;
+      odometry.add({t, T});
+    }
+    ASSERT_EQ(odometry.jumps(), std::vector<StampNs>{jump});
+    const CompensationResult result =
+        compensate(drive.scan, reference, odometry, lidarOnVehicle(), CompensationConfig());
+    const Transform T_ref_fixed = (motion(reference) * lidarOnVehicle()).inverse();
+    std::size_t marked = 0;
+    for (std::size_t i = 0; i < drive.scan.size(); ++i) {
+      const Firing& firing = drive.scan.firings[drive.scan.firing[i]];
+      const bool same_side =
+          reference < jump ? firing.end_ns <= jump - kReadingNs : firing.begin_ns >= jump;
+      ASSERT_EQ(result.cloud.status[i], same_side ? 0 : 4);
+      marked += same_side ? 0 : 1;
+      const Eigen::Vector3d point(drive.scan.x[i], drive.scan.y[i], drive.scan.z[i]);
+      const Eigen::Vector3d truth =
+          T_ref_fixed * motion(drive.scan.time_ns[i]) * lidarOnVehicle() * point;
+      if (same_side) {
+        ASSERT_LT((at(result.cloud, i) - truth).norm(), 0.5e-3);
+      }
+    }
+    EXPECT_EQ(result.counters.marked_points, marked);
+    EXPECT_GT(marked, 0u);
+    EXPECT_FALSE(vehicleMotion(odometry, jump - 20000000, jump + 20000000));
+    EXPECT_TRUE(vehicleMotion(odometry, jump, jump + 20000000));
+  }
+  PoseBuffer odometry(0, 100.0);
+  for (StampNs t = kBefore; t <= kAfter; t += kReadingNs) odometry.add({t, motion(t)});
+  EXPECT_TRUE(odometry.jumps().empty());
 }
 
 }  // namespace

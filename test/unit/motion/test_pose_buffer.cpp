@@ -144,5 +144,64 @@ TEST(PoseBuffer, RefusesBrokenPosesAndStaysAsItWas) {
   EXPECT_EQ(buffer.size(), 1u);
 }
 
+StampedPose placed(StampNs stamp, double x, double yaw = 0.0) {
+  StampedPose pose{stamp, Transform::Identity()};
+  pose.T_fixed_vehicle.translation().x() = x;
+  pose.T_fixed_vehicle.linear() =
+      Eigen::AngleAxisd(yaw, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+  return pose;
+}
+
+TEST(PoseBuffer, AJumpPartsItsReadings) {
+  constexpr StampNs ms = 1000000;
+  PoseBuffer buffer(0, 100.0);
+  for (int i = 0; i < 20; ++i) buffer.add(placed(i * 10 * ms, 0.2 * i + (i < 12 ? 0.0 : 3.0)));
+  EXPECT_EQ(buffer.jumps(), std::vector<StampNs>{120 * ms});
+  EXPECT_TRUE(buffer.covers(110 * ms) && buffer.covers(120 * ms));
+  EXPECT_FALSE(buffer.covers(115 * ms));
+  EXPECT_FALSE(buffer.lookup(115 * ms));
+  EXPECT_EQ(buffer.stretchAround(50 * ms), (PoseBuffer::Stretch{0, 12}));
+  EXPECT_EQ(buffer.stretchAround(115 * ms), (PoseBuffer::Stretch{0, 12}));
+  EXPECT_EQ(buffer.stretchAround(116 * ms), (PoseBuffer::Stretch{12, 20}));
+  EXPECT_EQ(buffer.stretchAround(-ms), (PoseBuffer::Stretch{0, 12}));
+  EXPECT_EQ(buffer.stretchAround(900 * ms), (PoseBuffer::Stretch{12, 20}));
+  PoseBuffer unlimited;
+  for (const StampedPose& reading : buffer.readings()) unlimited.add(reading);
+  EXPECT_TRUE(unlimited.jumps().empty());
+
+  PoseBuffer turned(0, 100.0);
+  for (int i = 0; i < 4; ++i) turned.add(placed(i * 10 * ms, 0.0, i < 2 ? 0.0 : 1.0));
+  EXPECT_EQ(turned.jumps(), std::vector<StampNs>{20 * ms});
+}
+
+TEST(PoseBuffer, TwoSourcesOfOnePoseJumpToAndFro) {
+  constexpr StampNs ms = 1000000;
+  PoseBuffer buffer(0, 100.0);
+  for (int i = 0; i < 20; ++i) buffer.add(placed(i * 5 * ms, 0.1 * i + (i % 2) * 0.6));
+  // All but the first step, which could be a fast one.
+  EXPECT_EQ(buffer.jumps().size(), 18u);
+  PoseBuffer noisy(0, 100.0);
+  for (int i = 0; i < 20; ++i) noisy.add(placed(i * 5 * ms, 0.1 * i + (i % 2) * 0.02));
+  EXPECT_TRUE(noisy.jumps().empty());
+}
+
+TEST(PoseBuffer, ManyReadingsInAnyOrderAreAsOneByOne) {
+  constexpr StampNs ms = 1000000;
+  std::vector<StampedPose> readings;
+  for (int i = 0; i < 50; ++i) {
+    readings.push_back(placed((i * 37 % 50) * 10 * ms, i * 37 % 50 < 30 ? 0.0 : 40.0));
+  }
+  readings.push_back(placed(70 * ms, 0.5));  // a second one
+  PoseBuffer together(400 * ms, 100.0), single(400 * ms, 100.0);
+  together.add(readings);
+  for (const StampedPose& reading : readings) single.add(reading);
+  ASSERT_EQ(together.size(), 41u);
+  ASSERT_EQ(single.jumps(), together.jumps());
+  ASSERT_EQ(together.jumps(), std::vector<StampNs>{300 * ms});
+  for (std::size_t i = 0; i < together.size(); ++i) {
+    EXPECT_EQ(together.readings()[i].stamp, (i + 9) * 10 * ms);
+  }
+}
+
 }  // namespace
 }  // namespace semantic_lidar_fusion

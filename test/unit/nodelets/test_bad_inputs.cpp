@@ -539,11 +539,15 @@ void cloudCases(std::vector<Case>* cases) {
   add(
       14, "data too long", [](Layout& l) { l.message.data.push_back(0); }, "121 bytes");
   add(
-      14, "row_step too small", [](Layout& l) { l.message.row_step = 119; }, "row_step is 119");
+      14, "row_step too small for data that fit", [](Layout& l) { l.message.row_step = 119; },
+      "6 points");
   add(
-      14, "row_step of zero", [](Layout& l) { l.message.row_step = 0; }, "row_step is 0");
+      14, "row_step of zero", [](Layout& l) { l.message.row_step = 0; }, "6 points");
   add(
-      14, "row_step beyond all", [](Layout& l) { l.message.row_step = 0xFFFFFFFF; }, "bytes");
+      14, "row_step beyond all", [](Layout& l) { l.message.row_step = 0xFFFFFFFF; }, "6 points");
+  add(
+      14, "row_step and data too small",
+      [](Layout& l) { l.message.row_step = 119, l.message.data.pop_back(); }, "row_step is 119");
   add(
       14, "point_step of zero", [](Layout& l) { l.message.point_step = 0; }, "point_step of 0");
   add(

@@ -2,7 +2,9 @@
 #include <gtest/gtest.h>
 #include <tf2/buffer_core.h>
 
+#include <algorithm>
 #include <cmath>
+#include <functional>
 #include <limits>
 #include <random>
 
@@ -256,6 +258,128 @@ TEST(TfPoseSource, GapSaysThatTheHistoryIsTooShort) {
   EXPECT_EQ(future.find("older than"), std::string::npos) << future;
 }
 
+std::string notesOf(TfPoseSource& source) {
+  std::string text;
+  for (const std::string& note : source.takeNotes()) text += note + "\n";
+  return text;
+}
+
+TEST(TfPoseSource, RefusesWithTheReasonOnceForEachFrame) {
+  const auto reasonOf = [](const std::function<void(geometry_msgs::TransformStamped&)>& spoil) {
+    TfPoseSource source(defaults());
+    auto message = stamped("odom", "base_link", kStart, driven(0));
+    spoil(message);
+    for (int i = 0; i < 3; ++i) EXPECT_FALSE(source.add(message, false));
+    const std::string text = notesOf(source);
+    EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 1) << text;
+    EXPECT_EQ(source.problem() + "\n", text);
+    return text;
+  };
+  using Message = geometry_msgs::TransformStamped;
+  const auto expect = [&](const std::string& word, const std::function<void(Message&)>& spoil) {
+    const std::string text = reasonOf(spoil);
+    EXPECT_NE(text.find(word), std::string::npos) << text;
+  };
+  expect("1.02", [](Message& m) {
+    m.transform.rotation.w *= 1.02;
+    m.transform.rotation.z *= 1.02;
+  });
+  expect("norm 0", [](Message& m) { m.transform.rotation.w = m.transform.rotation.z = 0.0; });
+  expect("stamp is 0", [](Message& m) { m.header.stamp = ros::Time(); });
+  expect("header.frame_id is empty", [](Message& m) { m.header.frame_id.clear(); });
+  expect("child_frame_id is empty", [](Message& m) { m.child_frame_id.clear(); });
+  expect("below itself", [](Message& m) { m.child_frame_id = "odom"; });
+  expect("finite", [](Message& m) { m.transform.translation.y = std::nan(""); });
+  expect("odometry.largest_coordinate_m", [](Message& m) { m.transform.translation.x = 1e39; });
+}
+
+TEST(TfPoseSource, TwoValuesOfAStaticTransformAreSaidOnce) {
+  TfPoseSource source(defaults());
+  source.add(stamped("base_link", "velodyne", kStart, pose(1, 0, 0)), true);
+  source.add(stamped("base_link", "velodyne", kStart, pose(1, 0, 0)), true);
+  source.add(stamped("base_link", "velodyne", kStart, pose(1, 0, 0)), false);
+  EXPECT_EQ(notesOf(source), "") << "one value twice harms nothing";
+  for (int i = 0; i < 5; ++i) {
+    source.add(stamped("base_link", "velodyne", kStart + i * kMs, pose(1.5, 0, 0)), false);
+  }
+  const std::string both = notesOf(source);
+  EXPECT_NE(both.find("(1.000, 0.000, 0.300)"), std::string::npos) << both;
+  EXPECT_NE(both.find("(1.500, 0.000, 0.300)"), std::string::npos) << both;
+  EXPECT_EQ(std::count(both.begin(), both.end(), '\n'), 1) << both;
+  EXPECT_EQ(source.extrinsics("base_link", "velodyne").transform->translation().x(), 1.0)
+      << "/tf_static counts";
+
+  source.add(stamped("base_link", "velodyne", kStart, pose(2, 0, 0)), true);
+  const std::string changed = notesOf(source);
+  EXPECT_NE(changed.find("(2.000, 0.000, 0.300)"), std::string::npos) << changed;
+  EXPECT_EQ(source.extrinsics("base_link", "velodyne").transform->translation().x(), 2.0);
+}
+
+TEST(TfPoseSource, ExtrinsicsThatChangeAreSaid) {
+  TfPoseSource source(defaults());
+  source.add(stamped("odom", "base_link", kStart, driven(0)), false);
+  source.odometry();
+  for (int i = 0; i < 3; ++i) {
+    source.add(stamped("base_link", "mast", kStart + i * 10 * kMs, pose(1, 0, 0)), false);
+    source.add(stamped("base_link", "wheel", kStart + i * 10 * kMs, pose(0, 0, i)), false);
+    source.extrinsics("base_link", "mast");
+  }
+  EXPECT_EQ(notesOf(source), "") << "the wheel concerns no sensor";
+  source.add(stamped("base_link", "mast", kStart + 40 * kMs, pose(1, 0, 0.1)), false);
+  source.extrinsics("base_link", "mast");
+  const std::string text = notesOf(source);
+  EXPECT_NE(text.find("base_link <- mast changes"), std::string::npos) << text;
+  source.extrinsics("base_link", "mast");
+  EXPECT_EQ(notesOf(source), "");
+}
+
+TEST(TfPoseSource, AJumpIsSaidOnceAndIsTheReasonOfAGap) {
+  TfPoseSource source(defaults());
+  for (int i = 0; i < 20; ++i) {
+    Transform T = driven(0.01 * i);
+    T.translation().x() += i < 10 ? 0.0 : 10.0;
+    source.add(stamped("odom", "base_link", kStart + i * 10 * kMs, T), false);
+  }
+  source.odometry();
+  const std::string text = notesOf(source);
+  EXPECT_NE(text.find("jumps by 10.1"), std::string::npos) << text;
+  source.odometry();
+  EXPECT_EQ(notesOf(source), "");
+  EXPECT_NE(source.gap(kStart, kStart + 150 * kMs).find("jumps by"), std::string::npos);
+  EXPECT_EQ(source.gap(kStart, kStart + 90 * kMs), "");
+  EXPECT_EQ(source.gap(kStart + 100 * kMs, kStart + 190 * kMs), "");
+}
+
+TEST(TfPoseSource, TwoClocksAnHourApartAndStampsThatDecreaseGiveEveryReading) {
+  // Through two moving edges, so that a pose takes more than a copy.
+  const auto fill = [](TfPoseSource& source, StampNs t, double t_s) {
+    source.add(stamped("odom", "footprint", t, driven(t_s)), false);
+    source.add(stamped("footprint", "base_link", t, pose(0, 0, 0)), false);
+    source.read();
+  };
+  const StampNs hour = 3600 * kNsPerSecond;
+  constexpr int kCount = 4000;
+  TfPoseSource two(defaults());
+  for (int i = 0; i < kCount; ++i) {
+    fill(two, kStart + i * 10 * kMs, 0.01 * i);
+    fill(two, kStart + hour + i * 10 * kMs, 0.01 * i);
+  }
+  const PoseBuffer& odometry = two.odometry();
+  // The first of the earlier clock is read when its last edge comes.
+  EXPECT_GE(odometry.size(), 2u * kCount - 2);
+  for (const StampNs t : {kStart + 20 * kNsPerSecond, kStart + hour + 20 * kNsPerSecond}) {
+    ASSERT_TRUE(odometry.covers(t));
+    Transform expected = driven(20.0) * pose(0, 0, 0);
+    expectEqual(*odometry.lookup(t), expected, 1e-6);
+  }
+  TfPoseSource backward(defaults());
+  for (int i = kCount - 1; i >= 0; --i) fill(backward, kStart + i * 10 * kMs, 0.01 * i);
+  EXPECT_GE(backward.odometry().size(), kCount - 2u);
+  ASSERT_TRUE(backward.odometry().covers(kStart + 20 * kNsPerSecond));
+  expectEqual(*backward.odometry().lookup(kStart + 20 * kNsPerSecond), driven(20.0) * pose(0, 0, 0),
+              1e-6);
+}
+
 nav_msgs::Odometry odometry(const std::string& child, StampNs stamp, const Transform& T) {
   const auto as_tf = stamped("odom", child, stamp, T);
   nav_msgs::Odometry message;
@@ -304,6 +428,25 @@ TEST(OdometryTopic, UnusableMessagesAreRefused) {
   EXPECT_FALSE(source.add(odometry("base_link", 0, driven(0))));
   EXPECT_EQ(source.counters().rejected, 2u);
   EXPECT_TRUE(source.odometry().empty());
+}
+
+TEST(OdometryTopic, APoseThatDoesNotFollowItsTwistIsSaid) {
+  const auto notes = [](double pose_mps, double twist_mps) {
+    TfPoseSourceConfig config;
+    config.source = OdometrySource::kTopic;
+    TfPoseSource source(config);
+    for (int i = 0; i < 150; ++i) {
+      auto message = odometry("base_link", kStart + i * 10 * kMs, pose(0.01 * i * pose_mps, 0, 0));
+      message.twist.twist.linear.x = twist_mps;
+      source.add(message);
+    }
+    return notesOf(source);
+  };
+  EXPECT_NE(notes(0.0, 5.0).find("frozen"), std::string::npos);
+  EXPECT_NE(notes(5.0, 18.0).find("another unit"), std::string::npos);
+  EXPECT_EQ(notes(5.0, 5.2), "");
+  EXPECT_EQ(notes(0.0, 0.0), "");
+  EXPECT_EQ(notes(5.0, 0.0), "") << "no twist";
 }
 
 }  // namespace
