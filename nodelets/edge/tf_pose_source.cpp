@@ -180,6 +180,9 @@ bool TfPoseSource::add(const geometry_msgs::TransformStamped& message, bool is_s
   }
   const auto known = edges_.find(child);
   if (known != edges_.end()) is_static = known->second.is_static;  // tf2: the first one decides
+  if (!is_static && stamp == 0) {
+    return refuse(child, name, "its stamp is 0, and it came on /tf before");
+  }
   if (known != edges_.end() && !is_static && stamp == known->second.newest) {
     ++counters_.repeated;
     return false;
@@ -336,9 +339,8 @@ const PoseBuffer& TfPoseSource::odometry() {
   read();
   if (!late_.empty()) odometry_.add(late_);
   late_.clear();
-  for (const StampNs stamp : odometry_.jumps()) {
-    note("jump", jumpText(stamp));
-    break;
+  if (!odometry_.jumps().empty() && noted_.count("jump") == 0) {
+    note("jump", jumpText(odometry_.jumps().front()));
   }
   return odometry_;
 }
@@ -377,7 +379,7 @@ std::string TfPoseSource::gap(StampNs from_ns, StampNs to_ns) {
   const PoseBuffer& poses = odometry();
   const std::vector<StampNs>& jumps = poses.jumps();
   const auto jump = std::upper_bound(jumps.begin(), jumps.end(), std::min(from_ns, to_ns));
-  if (jump != jumps.end() && std::prev(poses.readings().end())->stamp >= *jump) {
+  if (jump != jumps.end()) {
     const auto& readings = poses.readings();
     const auto behind =
         std::lower_bound(readings.begin(), readings.end(), *jump,

@@ -84,7 +84,7 @@ void run(const std::uint8_t* data, std::size_t size) {
     expectFinite(*values, "points are finite");
   }
   for (std::size_t i = 0; i < n; ++i) {
-    expect(cloud.ring[i] < 32, "rings are those of the sensor");
+    expect(cloud.ring[i] < 128, "rings are those of the sensor");
     expect(cloud.firing[i] < cloud.firings.size(), "a point's firing exists");
     const Firing& firing = cloud.firings[cloud.firing[i]];
     expect(firing.begin_ns <= cloud.time_ns[i] && cloud.time_ns[i] <= firing.end_ns,

@@ -104,7 +104,7 @@ cameras:
      reorder_window: 0.1}
   - {name: c1}
 lidar: {input: points, topic: /ouster/points, model: VLP-32C, frame: /os, min_range_m: 1,
-        max_range_m: 90, time_field: t, time_unit: us, time_reference: scan_end,
+        max_range_m: 90, largest_coordinate_m: 500, longest_scan_s: 2, time_field: t, time_unit: us, time_reference: scan_end,
         without_time: azimuth, packet_stamp: middle, time_offset: -18,
         vertical_offsets_m: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
                              0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.01]}
@@ -114,7 +114,7 @@ superpixels: {count: 500, compactness: 2.5, iterations: 4, scale: 0.5, warm_star
 uncertainty: {temperature: 1.5, exponent: 0}
 motion: {enabled: false, granularity: packet}
 odometry: {source: topic, topic: /odo, time_offset: 0.01, lookup: closest, on_missing: extrapolate,
-           max_extrapolation: 0.05, timeout: 0.3}
+           max_extrapolation: 0.05, timeout: 0.3, fastest_mps: 30, largest_coordinate_m: 1e7}
 reference: {choose: scan_end, camera: c1, timeout: 0.5}
 image_choice: closest_to_sweep
 segmentation: {model: usyd.yaml, mode: on_request}
@@ -149,6 +149,8 @@ threads: 3
   EXPECT_EQ(rig.lidar.frame, "os");
   EXPECT_EQ(rig.lidar.min_range_m, 1);
   EXPECT_EQ(rig.lidar.max_range_m, 90);
+  EXPECT_EQ(rig.lidar.largest_coordinate_m, 500);
+  EXPECT_EQ(rig.lidar.longest_scan_s, 2);
   EXPECT_EQ(rig.lidar.time_field, "t");
   EXPECT_EQ(rig.lidar.time_unit, TimeUnit::kMicroseconds);
   EXPECT_EQ(rig.lidar.time_reference, TimeReference::kScanEnd);
@@ -175,6 +177,8 @@ threads: 3
   EXPECT_EQ(rig.odometry.on_missing, OnMissingOdometry::kExtrapolate);
   EXPECT_EQ(rig.odometry.max_extrapolation_s, 0.05);
   EXPECT_EQ(rig.odometry.timeout_s, 0.3);
+  EXPECT_EQ(rig.odometry.fastest_mps, 30);
+  EXPECT_EQ(rig.odometry.largest_coordinate_m, 1e7);
   EXPECT_EQ(rig.reference.choose, ReferenceChoice::kScanEnd);
   EXPECT_EQ(rig.referenceCamera(), 1);
   EXPECT_EQ(rig.reference.timeout_s, 0.5);
@@ -254,6 +258,11 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
   for (const BadCase& bad : {
            BadCase{"[1, 2]", "rig.yaml: (a list of 2): must be a map"},
            {"just text", "rig.yaml: just text: must be a map"},
+           {"lidar: {longest_scan_s: 0}",
+            "rig.yaml: lidar.longest_scan_s = 0: must be a number from 0.001 to 60"},
+           {"lidar: {model: HDL-64E}",
+            "rig.yaml: lidar.model = HDL-64E: must be one of auto, VLP16, "},
+           {"odometry: {fastest_mps: -1}", "rig.yaml: odometry.fastest_mps = -1: must be "},
            {"occlusion: {mdoe: off}",
             "rig.yaml: occlusion.mdoe = off: unknown key; did you mean "
             "'mode'?"},
