@@ -744,7 +744,7 @@ ReadCloud PointCloudReader::read(const PointCloudBytes& bytes) const {
 
   const std::uint64_t row_bytes = checkLayout(bytes);
   if (row_bytes != bytes.row_step) {
-    result.notes.push_back(
+    result.warnings.push_back(
         "row_step is not width x point_step, as which it is taken: the data fit");
   }
   const std::array<Field, 3> xyz{

@@ -13,8 +13,8 @@ constexpr double kRotationTolerance = 1e-3;
 /// What noise and small corrections of an odometry add to a step, however short it is.
 constexpr double kSlackM = 0.2, kSlackRad = 0.2;
 constexpr double kFastestTurnRadS = 20.0;
-/// A vehicle does not go this far and back again between three readings.
-constexpr double kToAndFroM = 0.1;
+/// A vehicle does not go to and fro by this way between three readings.
+constexpr double kToAndFroM = 0.3;
 constexpr StampNs kToAndFroNs = 500000000;
 
 bool isBefore(const StampedPose& reading, StampNs t) { return reading.stamp < t; }
@@ -104,9 +104,11 @@ bool PoseBuffer::isJump(std::size_t to) const {
                               .angularDistance(Eigen::Quaterniond(b.T_fixed_vehicle.linear()));
   if (turn_rad > kSlackRad + kFastestTurnRadS * dt_s) return true;
   if (to < 2 || b.stamp - readings_[to - 2].stamp > kToAndFroNs) return false;
-  const double both_m =
-      (b.T_fixed_vehicle.translation() - readings_[to - 2].T_fixed_vehicle.translation()).norm();
-  return step_m > kToAndFroM + 3.0 * both_m;
+  // The way there and back again is longer than the straight one.
+  const Eigen::Vector3d before = readings_[to - 2].T_fixed_vehicle.translation();
+  const double previous_m = (a.T_fixed_vehicle.translation() - before).norm();
+  const double straight_m = (b.T_fixed_vehicle.translation() - before).norm();
+  return previous_m + step_m - straight_m > kToAndFroM;
 }
 
 /// Judges the steps to the readings from .. to, at most the last one.
