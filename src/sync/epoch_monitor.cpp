@@ -41,8 +41,11 @@ void EpochMonitor::observeLead(StampNs stamp, Work work) {
     goOn();
     return;
   }
-  const auto previous = std::find_if(held_.rbegin(), held_.rend(), is_lead);
-  if (previous != held_.rend() && !follows(previous->stamp)) {
+  std::optional<StampNs> newest_held;
+  for (const Held& held : held_) {
+    if (is_lead(held)) newest_held = std::max(newest_held.value_or(held.stamp), held.stamp);
+  }
+  if (newest_held && !follows(*newest_held)) {
     for (const Held& wrong : take(is_lead)) discard(wrong);
   }
   hold({config_.lead, stamp, Doubt::kElsewhere, 0, std::move(work)});
