@@ -74,12 +74,4 @@ class RadialLens : public Lens {
   double begin_rad_, end_rad_;
 };
 
-// Makers of the rows of lensKinds().
-std::unique_ptr<const Lens> makePinhole(const LensParameters&, double, std::vector<std::string>*);
-std::unique_ptr<const Lens> makePlumbBob(const LensParameters&, double, std::vector<std::string>*);
-std::unique_ptr<const Lens> makeRationalPolynomial(const LensParameters&, double,
-                                                   std::vector<std::string>*);
-std::unique_ptr<const Lens> makeEquidistant(const LensParameters&, double,
-                                            std::vector<std::string>*);
-
 }  // namespace semantic_lidar_fusion

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: MIT
-// Lenses that bend the plane of a central projection radially and tangentially: pinhole, plumb_bob
-// and rational_polynomial (Brown-Conrady with OpenCV's coefficients), whose projection centre is
-// the camera's.
+// Lenses that bend the plane of a central projection radially and tangentially. Pinhole, plumb_bob
+// and rational_polynomial (Brown-Conrady with OpenCV's coefficients) project from the camera's
+// centre. omni (C. Mei, P. Rives: "Single View Point Omnidirectional Camera Calibration from Planar
+// Grids", ICRA 2007) projects the unit sphere from a point xi behind its centre.
 #include <Eigen/Dense>
 #include <cmath>
 
@@ -13,6 +14,8 @@ namespace {
 
 /// Squared radius up to which fold-over and pole are sought: 6e-7 deg short of 90 deg.
 constexpr double kMaxSquaredRadius = 1e16;
+/// A sphere seen from further away is a plane but for rounding.
+constexpr double kMostXi = 100.0;
 
 /// a (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3) + tangential terms, s = |a|^2.
 class Bending {
@@ -28,7 +31,9 @@ class Bending {
            (1.0 + s * (d_[5] + s * (d_[6] + s * d_[7])));
   }
 
-  /// Largest radius on the rising branch of r N(r^2) / D(r^2), before D's first root.
+  /// Radius of the disk about the origin in which the plane is not folded: the radial part rises,
+  /// has no pole, and the tangential terms, whatever the direction, weigh less than its rise. The
+  /// symmetric Jacobian is positive definite there, so apply() is one-to-one.
   double foldOverRadius() const {
     const Polynomial n{1.0, d_[0], d_[1], d_[4]};
     const Polynomial q{1.0, d_[5], d_[6], d_[7]};
@@ -37,8 +42,13 @@ class Bending {
     const Polynomial gain = product(derivative(n), q);
     const Polynomial loss = product(n, derivative(q));
     for (std::size_t i = 0; i < gain.size(); ++i) slope[i + 1] += 2.0 * (gain[i] - loss[i]);
-    return std::sqrt(
+    const double radius = std::sqrt(
         std::min(firstRoot(slope, 0.0, kMaxSquaredRadius), firstRoot(q, 0.0, kMaxSquaredRadius)));
+    const double tangential = 6.0 * std::hypot(d_[2], d_[3]);  // of r, the least eigenvalue
+    if (tangential == 0.0) return radius;
+    const double limit = std::min(radius, std::sqrt(kMaxSquaredRadius));
+    return std::min({radius, firstRoot(exceeding(slope, tangential, product(q, q)), 0.0, limit),
+                     firstRoot(exceeding(n, tangential, q), 0.0, limit)});
   }
 
   Eigen::Vector2d apply(const Eigen::Vector2d& a) const {
@@ -79,34 +89,64 @@ class Bending {
     while (high < bracket_end && excess(high) < 0.0) high = std::min(bracket_end, 2.0 * high);
     const double start = excess(high) < 0.0 ? high : bisect(excess, 0.0, high);
     Eigen::Vector2d a = target * (start / radius);
-    constexpr int kMaxIterations = 50;
+    constexpr int kMaxIterations = 50, kMaxHalvings = 60;
+    const double edge = max_radius * (1.0 + kEdgeSlack);
+    double residual = (apply(a) - target).norm();
     for (int i = 0; i < kMaxIterations; ++i) {
-      const Eigen::Vector2d step = jacobian(a).fullPivLu().solve(target - apply(a));
+      Eigen::Vector2d step = jacobian(a).fullPivLu().solve(target - apply(a));
       if (!step.allFinite()) return std::nullopt;
-      a += step;
       if (step.norm() <= 1e-14 * (1.0 + a.norm())) break;
+      // Shorter steps where the whole one leaves the disk or leads nowhere.
+      double next = (apply(a + step) - target).norm();
+      for (int k = 0; k < kMaxHalvings && !(next < residual && (a + step).norm() <= edge); ++k) {
+        step *= 0.5;
+        next = (apply(a + step) - target).norm();
+      }
+      if (!(next < residual)) break;
+      a += step;
+      residual = next;
     }
-    const double residual = (apply(a) - target).norm();
     if (!(residual <= 1e-9 * (1.0 + radius))) return std::nullopt;
     return a;
   }
 
  private:
+  /// n(r^2) - factor r q(r^2) as a polynomial in r.
+  static Polynomial exceeding(const Polynomial& n, double factor, const Polynomial& q) {
+    Polynomial result(2 * std::max(n.size(), q.size()), 0.0);
+    for (std::size_t i = 0; i < n.size(); ++i) result[2 * i] += n[i];
+    for (std::size_t i = 0; i < q.size(); ++i) result[2 * i + 1] -= factor * q[i];
+    return result;
+  }
+
   std::array<double, 8> d_;
   bool none_;
 };
 
 class RadtanLens : public Lens {
  public:
-  RadtanLens(const std::array<double, 8>& d, double max_theta_rad) : bending_(d) {
+  /// `xi` >= 0; 0 = the camera's centre.
+  RadtanLens(double xi, const std::array<double, 8>& d, double max_theta_rad)
+      : xi_(xi), least_cosine_(xi <= 1.0 ? -xi : -1.0 / xi), bending_(d) {
     max_radius_ = bending_.none() ? kInfinity : bending_.foldOverRadius();
-    if (max_theta_rad < 0.5 * kPi) max_radius_ = std::min(max_radius_, std::tan(max_theta_rad));
-    max_theta_rad_ = std::atan(max_radius_);
+    // Beyond least_cosine_ the radius of the plane falls again, or is on the other side of it.
+    const double edge_rad = xi == 0.0 ? 0.5 * kPi : std::acos(least_cosine_);
+    if (max_theta_rad < edge_rad) {
+      max_radius_ = std::min(max_radius_,
+                             xi == 0.0 ? std::tan(max_theta_rad)
+                                       : std::sin(max_theta_rad) / (std::cos(max_theta_rad) + xi));
+    }
+    max_theta_rad_ = xi == 0.0 ? std::atan(max_radius_) : std::min(edge_rad, max_theta_rad);
+    if (xi != 0.0 && max_radius_ < kInfinity) {
+      const auto edge = lifted({max_radius_, 0.0});
+      if (edge) max_theta_rad_ = std::min(max_theta_rad_, angleFromAxis(*edge));
+    }
   }
 
   std::optional<Eigen::Vector2d> project(const Eigen::Vector3d& p) const override {
-    if (!(p.z() > 0.0)) return std::nullopt;
-    const Eigen::Vector2d a = p.head<2>() / p.z();
+    const double d1 = xi_ == 0.0 ? 0.0 : p.norm();
+    if (!(p.z() > least_cosine_ * d1)) return std::nullopt;
+    const Eigen::Vector2d a = p.head<2>() / (p.z() + xi_ * d1);
     if (!(a.norm() <= max_radius_)) return std::nullopt;
     return bending_.none() ? a : bending_.apply(a);
   }
@@ -119,29 +159,46 @@ class RadtanLens : public Lens {
       a = *source;
     }
     if (!(a.norm() <= max_radius_ * (1.0 + kEdgeSlack))) return std::nullopt;
-    return Eigen::Vector3d(a.x(), a.y(), 1.0).stableNormalized();
+    return lifted(a);
   }
 
   Matrix23d jacobian(const Eigen::Vector3d& p) const override {
-    const Matrix23d j = quotientJacobian(p, p.z(), Eigen::Vector3d::UnitZ());
-    return bending_.none() ? j : Matrix23d(bending_.jacobian(p.head<2>() / p.z()) * j);
+    const double d1 = p.norm();
+    const double d = p.z() + xi_ * d1;
+    const Matrix23d j = quotientJacobian(p, d, Eigen::Vector3d::UnitZ() + p * (xi_ / d1));
+    return bending_.none() ? j : Matrix23d(bending_.jacobian(p.head<2>() / d) * j);
   }
 
   double maxThetaRad() const override { return max_theta_rad_; }
   double maxThetaWithin(double radius) const override {
-    return bending_.none() ? std::min(std::atan(radius), max_theta_rad_) : max_theta_rad_;
+    if (!bending_.none()) return max_theta_rad_;
+    const auto edge = lifted({radius, 0.0});
+    return edge ? std::min(angleFromAxis(*edge), max_theta_rad_) : max_theta_rad_;
   }
+  double axialScale() const override { return 1.0 / (1.0 + xi_); }
 
  private:
+  /// The direction whose central projection is `a`; empty where there is none.
+  std::optional<Eigen::Vector3d> lifted(const Eigen::Vector2d& a) const {
+    if (xi_ == 0.0) return Eigen::Vector3d(a.x(), a.y(), 1.0).stableNormalized();
+    const double s = a.squaredNorm();
+    const double root = 1.0 + (1.0 - xi_ * xi_) * s;
+    if (!(root >= -kEdgeSlack)) return std::nullopt;
+    const double scale = (xi_ + std::sqrt(std::max(0.0, root))) / (1.0 + s);
+    return Eigen::Vector3d(scale * a.x(), scale * a.y(), scale - xi_).stableNormalized();
+  }
+
+  double xi_, least_cosine_;
   Bending bending_;
   double max_radius_ = 0;  ///< of the plane before it is bent
   double max_theta_rad_ = 0;
 };
 
-std::unique_ptr<const Lens> makeRadtan(const std::vector<double>& d, double max_theta_rad) {
+std::unique_ptr<const Lens> makeRadtan(double xi, const std::vector<double>& d,
+                                       double max_theta_rad) {
   std::array<double, 8> all{};
-  std::copy(d.begin(), d.begin() + std::min<std::ptrdiff_t>(8, d.end() - d.begin()), all.begin());
-  return std::make_unique<RadtanLens>(all, max_theta_rad);
+  std::copy_n(d.begin(), std::min(d.size(), all.size()), all.begin());
+  return std::make_unique<RadtanLens>(xi, all, max_theta_rad);
 }
 
 }  // namespace
@@ -156,12 +213,13 @@ std::unique_ptr<const Lens> makePinhole(const LensParameters& parameters, double
            "names no model, yet D holds " + std::to_string(d.size()) +
                " coefficients that are not all 0");
   }
-  return makeRadtan({}, max_theta_rad);
+  return makeRadtan(0.0, {}, max_theta_rad);
 }
 
 std::unique_ptr<const Lens> makePlumbBob(const LensParameters& parameters, double max_theta_rad,
                                          std::vector<std::string>* notes) {
   return makeRadtan(
+      0.0,
       checkedCoefficients(parameters, {0, 4, 5},
                           "must be 5 for plumb_bob (k1 k2 p1 p2 k3), or 4 or 0", notes),
       max_theta_rad);
@@ -177,7 +235,17 @@ std::unique_ptr<const Lens> makeRationalPolynomial(const LensParameters& paramet
     refuse(parameters.source, "D[8..]", "not all 0",
            "thin prism and tilt coefficients are not supported; calibrate with 8 coefficients");
   }
-  return makeRadtan(d, max_theta_rad);
+  return makeRadtan(0.0, d, max_theta_rad);
+}
+
+std::unique_ptr<const Lens> makeOmni(const LensParameters& parameters, double max_theta_rad,
+                                     std::vector<std::string>* notes) {
+  const std::vector<double> d = checkedCoefficients(
+      parameters, {1, 5, 6}, "must be 5 for omni (xi k1 k2 p1 p2), or 6 with k3, or 1", notes);
+  if (!(d[0] >= 0.0 && d[0] <= kMostXi)) {
+    refuse(parameters.source, "xi", d[0], "must lie in 0..100 for omni");
+  }
+  return makeRadtan(d[0], {d.begin() + 1, d.end()}, max_theta_rad);
 }
 
 }  // namespace semantic_lidar_fusion

@@ -93,17 +93,17 @@ void cameraInfoCases(std::vector<Case>* cases) {
   for (const std::size_t count : {0u, 1u, 3u, 5u, 8u}) {
     add(
         "equidistant with " + std::to_string(count) + " coefficients", kFisheye, false,
-        [count](Info& i) { i.D.assign(count, 0.0); }, "D.size = " + std::to_string(count));
+        [count](Info& i) { i.D.assign(count, 0.001); }, "D.size = " + std::to_string(count));
   }
   for (const std::size_t count : {1u, 3u, 6u, 8u}) {
     add(
         "plumb_bob with " + std::to_string(count) + " coefficients", "plumb_bob", false,
-        [count](Info& i) { i.D.assign(count, 0.0); }, "D.size = " + std::to_string(count));
+        [count](Info& i) { i.D.assign(count, 0.001); }, "D.size = " + std::to_string(count));
   }
   for (const std::size_t count : {0u, 4u, 5u, 9u, 15u}) {
     add(
         "rational_polynomial with " + std::to_string(count) + " coefficients",
-        "rational_polynomial", false, [count](Info& i) { i.D.assign(count, 0.0); },
+        "rational_polynomial", false, [count](Info& i) { i.D.assign(count, 0.001); },
         "D.size = " + std::to_string(count));
   }
   add(
