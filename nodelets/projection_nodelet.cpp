@@ -16,6 +16,7 @@
 #include "edge/conversions.h"
 #include "edge/tf_subscription.h"
 #include "edge/topics.h"
+#include "semantic_lidar_fusion/fusion/calibration_notes.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
@@ -82,6 +83,7 @@ class ProjectionNodelet : public FusionNodelet {
           getNodeHandle(), inputTopic(camera.config, camera.config.camera_info), 8,
           [&camera](const sensor_msgs::CameraInfoConstPtr& info) { camera.geometry.update(*info); },
           Health::Expect::kOnce);
+      if (camera.config.withoutCameraInfo()) health().retireInput(camera.info.getTopic());
     }
     startTicking();
   }
@@ -261,6 +263,7 @@ class ProjectionNodelet : public FusionNodelet {
                                       image ? &*image : nullptr, cloud.stamp,
                                       tf_->source().odometry(), T_vehicle_lidar.transform));
     }
+    for (const std::string& note : calibration_notes_.news(rig(), views)) NODELET_WARN_STREAM(note);
     const bool drawn = std::any_of(cameras_.begin(), cameras_.end(), [](const auto& camera) {
       return camera->overlay.getNumSubscribers() > 0;
     });
@@ -355,6 +358,7 @@ class ProjectionNodelet : public FusionNodelet {
   std::unique_ptr<TfSubscription> tf_;
   std::unique_ptr<EpochMonitor> epochs_;
   std::vector<std::unique_ptr<Camera>> cameras_;
+  CalibrationNotes calibration_notes_;
   ros::Publisher output_, class_info_;
   std::string told_note_;  ///< of the lidar's beams
   ros::Subscriber cloud_subscriber_, reference_subscriber_;

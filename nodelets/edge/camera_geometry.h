@@ -11,11 +11,16 @@
 
 namespace semantic_lidar_fusion {
 
-/// The model of one camera, derived anew whenever its camera_info changes.
+/// The model of one camera, derived anew whenever its camera_info changes. A lens file that names
+/// the camera's frame too needs no camera_info.
 class CameraGeometry {
  public:
   explicit CameraGeometry(const CameraConfig& config)
-      : options_{config.rectified, config.max_theta_deg} {}
+      : options_(config.modelOptions()), frame_(config.lens.frame) {
+    if (config.withoutCameraInfo()) {
+      model_ = std::make_shared<const CameraModel>(config.assumedInfo(), options_);
+    }
+  }
 
   /// Throws DataError if the camera_info is unusable; the camera has no model then.
   void update(const sensor_msgs::CameraInfo& message) {
@@ -27,11 +32,12 @@ class CameraGeometry {
   }
 
   const std::shared_ptr<const CameraModel>& model() const { return model_; }
-  /// Empty until a camera_info came.
-  std::string frame() const { return info_ ? info_->frame_id : std::string(); }
+  /// Empty until a camera_info came, unless the rig names it.
+  std::string frame() const { return frame_.empty() && info_ ? info_->frame_id : frame_; }
 
  private:
   CameraModelOptions options_;
+  std::string frame_;  ///< of the rig; empty = camera_info's
   std::optional<CameraInfo> info_;
   std::shared_ptr<const CameraModel> model_;
 };

@@ -19,10 +19,11 @@ std::string sourceOf(const CameraInfo& info) {
   return "camera_info of frame '" + info.frame_id + "'";
 }
 
+using semantic_lidar_fusion::refuse;
 template <typename Value>
 [[noreturn]] void refuse(const CameraInfo& info, const std::string& field, const Value& value,
                          const std::string& rule) {
-  semantic_lidar_fusion::refuse(sourceOf(info), field, value, rule);
+  refuse(sourceOf(info), field, value, rule);
 }
 
 void requirePositive(const CameraInfo& info, const std::string& field, double value) {
@@ -101,6 +102,29 @@ const LensKind& checkedKind(const CameraInfo& info, const std::vector<LensKind>&
          "must be equidistant (alias fisheye), plumb_bob, rational_polynomial or empty (pinhole)");
 }
 
+const LensKind& kindNamed(const LensParameters& lens, const std::vector<LensKind>& kinds) {
+  for (const LensKind& kind : kinds) {
+    if (kind.name == lens.model) return kind;
+  }
+  refuse(lens.source, "model", "'" + lens.model + "'", "must be the name of a lens");
+}
+
+/// A camera_info whose lens and focal lengths a file gives.
+CameraInfo withLens(CameraInfo info, const LensCalibration* lens) {
+  if (lens == nullptr) return info;
+  if (info.size == ImageSize()) info.size = lens->size;
+  if (info.size != lens->size) {
+    const auto text = [](const ImageSize& size) {
+      return std::to_string(size.width) + "x" + std::to_string(size.height);
+    };
+    refuse(info, "width x height", text(info.size),
+           "must be the resolution " + text(lens->size) + " of the " + lens->lens.source);
+  }
+  info.k = {lens->fx, lens->fx * lens->skew, lens->cx, 0.0, lens->fy, lens->cy, 0.0, 0.0, 1.0};
+  info.r.fill(0.0);
+  return info;
+}
+
 Eigen::Matrix3d checkedRotation(const CameraInfo& info) {
   if (std::all_of(info.r.begin(), info.r.end(), [](double r) { return r == 0.0; })) {
     return Eigen::Matrix3d::Identity();
@@ -118,6 +142,26 @@ Eigen::Matrix3d checkedRotation(const CameraInfo& info) {
   return r;
 }
 
+RowTimes timesOfRows(const ShutterConfig& shutter, const CameraInfo& info,
+                     const Reduction& reduction) {
+  using Direction = ShutterDirection;
+  const Direction direction = shutter.direction;
+  RowTimes result;
+  result.down = direction == Direction::kDown || direction == Direction::kUp;
+  const bool backwards = direction == Direction::kUp || direction == Direction::kLeft;
+  const double rows = result.down ? info.size.height : info.size.width;
+  const double stamped = shutter.stamp_row == StampRow::kFirst    ? 0.0
+                         : shutter.stamp_row == StampRow::kMiddle ? 0.5 * (rows - 1.0)
+                                                                  : rows - 1.0;
+  // Row of the sensor = first + binning * pixel (image_geometry's rule).
+  const double first = result.down ? info.roi_y : info.roi_x;
+  const double binning = result.down ? reduction.binning_y : reduction.binning_x;
+  const double row_s = shutter.readout_s / rows;
+  result.at_zero_s = ((backwards ? rows - 1.0 - first : first) - stamped) * row_s;
+  result.per_px_s = (backwards ? -1.0 : 1.0) * binning * row_s;
+  return result;
+}
+
 }  // namespace
 
 bool CameraInfo::operator==(const CameraInfo& other) const {
@@ -128,16 +172,19 @@ bool CameraInfo::operator==(const CameraInfo& other) const {
          roi_width == other.roi_width && roi_height == other.roi_height;
 }
 
-CameraModel::CameraModel(const CameraInfo& info, const CameraModelOptions& options,
+CameraModel::CameraModel(const CameraInfo& given, const CameraModelOptions& options,
                          const std::vector<LensKind>& lenses)
-    : rectified_(options.rectified) {
+    : rectified_(options.rectified), shutter_(options.shutter) {
+  const CameraInfo info = withLens(given, options.lens.get());
   const Reduction reduction = checkedReduction(info);
   size_ = reduction.size;
-  const LensKind& kind = checkedKind(info, lenses);
+  const LensKind& kind =
+      options.lens ? kindNamed(options.lens->lens, lenses) : checkedKind(info, lenses);
   const double max_theta_deg = options.max_theta_deg;
   if (!(max_theta_deg >= 0.0 && max_theta_deg <= 180.0)) {
     refuse(info, "max_theta_deg", max_theta_deg, "must lie in 0..180 (0 = no limit)");
   }
+  row_times_ = timesOfRows(shutter_, info, reduction);
   const double max_theta_rad = max_theta_deg > 0.0 ? max_theta_deg * kPi / 180.0 : kPi;
 
   if (rectified_) {
@@ -151,14 +198,16 @@ CameraModel::CameraModel(const CameraInfo& info, const CameraModelOptions& optio
     cx_ = (info.p[2] - info.roi_x) / reduction.binning_x;
     cy_ = (info.p[6] - info.roi_y) / reduction.binning_y;
     optical_centre_ = {-info.p[3] / info.p[0], -info.p[7] / info.p[5], 0.0};
-    lens_ = makePinhole({sourceOf(info), "pinhole", {}}, max_theta_rad, &notes_);
+    const LensParameters plain{sourceOf(info), "pinhole", {}};
+    lens_ = kindNamed(plain, lenses).make(plain, max_theta_rad, &notes_);
   } else {
     requirePositive(info, "K[0]", info.k[0]);
     requirePositive(info, "K[4]", info.k[4]);
     for (const std::size_t i : {1, 2, 5}) {
       requireFinite(info, "K[" + std::to_string(i) + "]", info.k[i]);
     }
-    lens_ = kind.make({sourceOf(info), kind.name, info.d}, max_theta_rad, &notes_);
+    const LensParameters parameters{sourceOf(info), kind.name, info.d};
+    lens_ = kind.make(options.lens ? options.lens->lens : parameters, max_theta_rad, &notes_);
     R_raw_camera_ = checkedRotation(info).transpose();
     fx_ = info.k[0] / reduction.binning_x;
     fy_ = info.k[4] / reduction.binning_y;

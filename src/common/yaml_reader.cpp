@@ -203,6 +203,8 @@ YAML::Node parseYamlFile(const std::string& path) {
   // A folder opens like a file and fails at the first byte.
   if (!file.is_open() || file.bad()) fail(path, "cannot be read; must be a readable file");
   text.resize(static_cast<std::size_t>(file.gcount()));
+  // OpenCV begins its files with "%YAML:1.0", which is no directive of YAML.
+  if (text.compare(0, 6, "%YAML:") == 0) text[0] = '#';
   return parseYaml(text, path);
 }
 

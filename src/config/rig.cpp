@@ -146,6 +146,41 @@ YamlTree classesTree(const LabelSet& set) {
   return tree;
 }
 
+LensFileConfig readLens(YamlSection section, const std::string& base_directory,
+                        Problems* problems) {
+  LensFileConfig lens;
+  const std::size_t before = problems->size();
+  readPath(section, "file", base_directory, &lens.file);
+  section.text("camera", &lens.camera);
+  readFrame(section, "frame", false, &lens.frame);
+  section.finish();
+  if (lens.file.empty() && !(lens.camera.empty() && lens.frame.empty())) {
+    section.problem("file", "must be given with `camera` and `frame`");
+  }
+  if (lens.file.empty() || problems->size() > before) return lens;
+  try {
+    lens.calibration = std::make_shared<const LensCalibration>(loadLens(lens.file, lens.camera));
+  } catch (const ConfigError& error) {
+    problems->insert(problems->end(), error.problems().begin(), error.problems().end());
+  }
+  return lens;
+}
+
+ShutterConfig readShutter(YamlSection section) {
+  ShutterConfig shutter;
+  section.number("readout_s", &shutter.readout_s, {0, 1});
+  section.choice<ShutterDirection>("direction", &shutter.direction,
+                                   {{"down", ShutterDirection::kDown},
+                                    {"up", ShutterDirection::kUp},
+                                    {"right", ShutterDirection::kRight},
+                                    {"left", ShutterDirection::kLeft}});
+  section.choice<StampRow>(
+      "stamp_row", &shutter.stamp_row,
+      {{"first", StampRow::kFirst}, {"middle", StampRow::kMiddle}, {"last", StampRow::kLast}});
+  section.finish();
+  return shutter;
+}
+
 CameraConfig readCamera(const YAML::Node& node, std::size_t index,
                         const std::string& base_directory, Problems* problems, YamlTree* list) {
   CameraConfig camera;
@@ -182,6 +217,11 @@ CameraConfig readCamera(const YAML::Node& node, std::size_t index,
   if (camera.score_format.scale == 0) section.problem("score_scale", "must not be 0");
   section.number("score_offset", &camera.score_format.offset);
   section.number("max_theta_deg", &camera.max_theta_deg, {0, 180});
+  camera.lens = readLens(section.child("lens"), base_directory, problems);
+  if (camera.lens.calibration && camera.rectified) {
+    section.problem("lens", "must be left out where `rectified` is true");
+  }
+  camera.shutter = readShutter(section.child("shutter"));
   section.number("time_offset", &camera.time_offset_s, kOffset);
   section.number("max_time_difference", &camera.max_time_difference_s, {0, kMaxTimeDifference_s});
   section.number("timeout", &camera.timeout_s, kWait);

@@ -33,7 +33,16 @@ CORE = {
     "map": {"common"},
     "projection": {"common", "camera"},
     "smoothing": {"common", "projection"},
-    "config": {"common", "superpixel", "lidar", "motion", "projection", "smoothing", "sync"},
+    "config": {
+        "common",
+        "superpixel",
+        "lidar",
+        "motion",
+        "camera",
+        "projection",
+        "smoothing",
+        "sync",
+    },
     "fusion": {
         "common",
         "superpixel",

@@ -380,6 +380,52 @@ def test_camera_without_camera_info_sees_nothing(tmp_path):
     assert "/front/camera_info" in fused.result.stderr  # the candidate
 
 
+def camchain(drive):
+    """The drive's cameras as Kalibr writes them; the second 0.5 m from where tf has it."""
+    text = ""
+    for i, camera in enumerate(drive.cameras):
+        centre = ((camera.width - 1) / 2.0, (camera.height - 1) / 2.0)
+        text += "cam%d:\n  camera_model: pinhole\n  distortion_model: equidistant\n" % i
+        text += "  intrinsics: [%r, %r, %r, %r]\n" % ((camera.focal,) * 2 + centre)
+        text += "  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n"
+        text += "  resolution: [%d, %d]\n" % (camera.width, camera.height)
+        if i > 0:
+            T = np.linalg.inv(camera.pose()) @ drive.cameras[i - 1].pose()
+            T[0, 3] += 0.5
+            rows = ", ".join(str(row.tolist()) for row in T)
+            text += "  T_cn_cnm1: [%s]\n" % rows
+    return text
+
+
+def test_lens_file_serves_like_camera_info_and_without_it(tmp_path, fused):
+    made = Made(tmp_path, Drive(camera_info_for=[]))
+    (tmp_path / "camchain.yaml").write_text(camchain(made.drive))
+    lens = "cameras.%s.lens={file: " + str(tmp_path / "camchain.yaml") + ", camera: %s, frame: %s}"
+    sets = [lens % (c.name, "cam%d" % i, c.name) for i, c in enumerate(made.drive.cameras)]
+    by_file = made.fuse("--set", sets[0], "--set", sets[1])
+    for ours, theirs in zip(by_file.of("/points_semantic"), fused.of("/points_semantic")):
+        assert ours.data == theirs.data
+    # What the file and tf say of the cameras' places differs by 0.5 m: said once.
+    text = by_file.result.stderr
+    assert text.count("camera left: ") == 1 and "0.5 m apart" in text, text
+    assert "camera_info" not in text, text
+
+
+def test_zeros_behind_the_coefficients_are_said_once(tmp_path, fused, monkeypatch):
+    original = bag_factory.camera_info_message
+
+    def longer(camera, time_ns):
+        message = original(camera, time_ns)
+        message.D = [0.0] * 5
+        return message
+
+    monkeypatch.setattr(bag_factory, "camera_info_message", longer)
+    five = Made(tmp_path, Drive()).fuse()
+    for ours, theirs in zip(five.of("/points_semantic"), fused.of("/points_semantic")):
+        assert ours.data == theirs.data
+    assert five.result.stderr.count("D holds 5 coefficients") == len(Drive().cameras)
+
+
 def test_odometry_that_ends_early_marks_firings(tmp_path):
     # The last scan starts at 0.3 s and lasts to 0.4 s; its t_ref is at 0.35 s.
     made = Made(tmp_path, Drive(odometry_until_s=0.3601))

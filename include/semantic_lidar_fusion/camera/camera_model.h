@@ -1,11 +1,15 @@
 // SPDX-License-Identifier: MIT
 /// The camera of a sensor_msgs/CameraInfo: a lens (see lens.h) before a sensor. Its lenses are
 /// pinhole, plumb_bob, rational_polynomial (Brown-Conrady with OpenCV's coefficients) and
-/// equidistant (Kannala-Brandt, paper eq. 6-11, valid beyond 90 deg).
+/// equidistant (Kannala-Brandt, paper eq. 6-11, valid beyond 90 deg); a file (see lens_file.h) may
+/// give these and others, in place of the message's.
 ///
-/// A point has a pixel only where the model is one-to-one: equidistant: theta = atan2(hypot(x, y),
-/// z) on the rising branch of theta_d; the others: z > 0, radius below the fold-over of the radial
-/// factor times r and (rational) below the first pole. Also theta <= max_theta_deg if given.
+/// A point has a pixel only where the model is one-to-one: equidistant, ocam, ftheta: theta =
+/// atan2(hypot(x, y), z) on the rising branch of the radius; pinhole, plumb_bob,
+/// rational_polynomial: z > 0, radius below the fold-over of the radial factor times r, or of the
+/// tangential terms if sooner, and (rational) below the first pole; omni: the
+/// same, and z > -w |p| with w = xi or 1 / xi, whichever is at most 1; double_sphere, eucm, ucm:
+/// the domain of their papers. Also theta <= max_theta_deg if given.
 ///
 /// Raw images: pixel = K, D of R^T p (R rotates the raw camera's axes to the rectified ones, in
 /// which the camera's frame is given), so that a point hits the same scene pixel raw and rectified.
@@ -19,9 +23,12 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "semantic_lidar_fusion/camera/lens.h"
+#include "semantic_lidar_fusion/camera/lens_file.h"
+#include "semantic_lidar_fusion/camera/shutter.h"
 #include "semantic_lidar_fusion/common/types.h"
 
 namespace semantic_lidar_fusion {
@@ -46,6 +53,10 @@ struct CameraInfo {
 struct CameraModelOptions {
   bool rectified = false;      ///< the image is rectified: P (with P[3], P[7]), no distortion
   double max_theta_deg = 0.0;  ///< largest angle from the optical axis; 0 = no limit
+  /// From a file, in place of camera_info's model, K, D and R; null = none. `rectified` must be
+  /// false. A camera_info of size 0 takes the file's.
+  std::shared_ptr<const LensCalibration> lens;
+  ShutterConfig shutter;
 };
 
 class CameraModel {
@@ -86,6 +97,8 @@ class CameraModel {
   double axialFocalY() const { return fy_ * lens_->axialScale(); }
   /// Largest valid angle from the axis: fold-over, pole or max_theta_deg, whichever is least.
   double maxThetaRad() const { return lens_->maxThetaRad(); }
+  bool rollingShutter() const { return shutter_.readout_s > 0.0; }
+  const RowTimes& rowTimes() const { return row_times_; }
   /// What was read against the letter of the camera_info, one sentence each; for users.
   const std::vector<std::string>& notes() const { return notes_; }
   /// Rotation from the camera's frame to the axes in which K, D hold.
@@ -97,6 +110,8 @@ class CameraModel {
   double fx_ = 0, fy_ = 0, cx_ = 0, cy_ = 0, skew_ = 0;
   Eigen::Vector3d optical_centre_ = Eigen::Vector3d::Zero();
   Eigen::Matrix3d R_raw_camera_ = Eigen::Matrix3d::Identity();  ///< R^T (image_geometry's rule)
+  ShutterConfig shutter_;
+  RowTimes row_times_;
   std::vector<std::string> notes_;
   std::shared_ptr<const Lens> lens_;
 };

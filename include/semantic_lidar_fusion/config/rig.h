@@ -7,10 +7,12 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <optional>
 #include <string>
 #include <vector>
 
+#include "semantic_lidar_fusion/camera/camera_model.h"
 #include "semantic_lidar_fusion/common/label_set.h"
 #include "semantic_lidar_fusion/config/overlap_rule.h"
 #include "semantic_lidar_fusion/lidar/lidar_spec.h"
@@ -31,6 +33,14 @@ namespace semantic_lidar_fusion {
 enum class ImageTransport : std::uint8_t { kRaw, kCompressed };
 enum class CameraInput : std::uint8_t { kScores, kLabels, kProbabilities };
 
+/// A file that calibrates the lens, in place of camera_info (see camera/lens_file.h).
+struct LensFileConfig {
+  std::string file;    ///< path; empty = camera_info calibrates it
+  std::string camera;  ///< the camera's key in a file of several
+  std::string frame;   ///< the camera's tf frame; empty = camera_info's, which must come then
+  std::shared_ptr<const LensCalibration> calibration;  ///< what the file holds; null without one
+};
+
 struct CameraConfig {
   std::string name;  ///< [A-Za-z][A-Za-z0-9_]*; output topics live in /<name>/
   std::string ns;    ///< key `namespace`: topics of the camera, e.g. /gmsl/A0; default: name
@@ -43,10 +53,24 @@ struct CameraConfig {
   std::string mask;          ///< path of an 8-bit image, 0 = never transfer; empty = none
   ScoreFormat score_format;  ///< keys score_scale, score_offset
   double max_theta_deg = 0.0;
+  LensFileConfig lens;
+  ShutterConfig shutter;
   double time_offset_s = 0.0;           ///< key time_offset
   double max_time_difference_s = 0.05;  ///< key max_time_difference
   double timeout_s = 0.2;               ///< key timeout
   double reorder_window_s = 0.0;        ///< key reorder_window; see SelectorCamera
+
+  /// Whether the rig file says all of the camera that camera_info could.
+  bool withoutCameraInfo() const { return lens.calibration && !lens.frame.empty(); }
+  /// The camera_info of such a camera.
+  CameraInfo assumedInfo() const {
+    CameraInfo info;
+    info.frame_id = lens.frame;
+    return info;
+  }
+  CameraModelOptions modelOptions() const {
+    return {rectified, max_theta_deg, lens.calibration, shutter};
+  }
 };
 
 enum class LidarInput : std::uint8_t { kPackets, kPoints };

@@ -252,6 +252,7 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
       ++state.none;
     }
   }
+  for (const std::string& note : calibration_notes_.news(rig_, views)) DropLog::warn(note);
   const FusionResult result = pipeline_.fuse(rigid.cloud, views, options_.all);
   if (!result.note.empty() && told_notes_.insert(result.note).second && !options_.quiet) {
     DropLog::note(result.note);
@@ -309,13 +310,16 @@ void BagFusion::copyTransforms(BagOutput* output) {
 CameraPlace BagFusion::place(std::size_t camera, const ros::Time& time,
                              const std::string& lidar_frame) {
   CameraPlace result;
-  const CameraInfo* info = cameraInfoAt(index_.cameras[camera], time);
-  if (!info) return result;
+  const CameraConfig& config = rig_.cameras[camera];
+  const CameraInfo* known = cameraInfoAt(index_.cameras[camera], time);
+  if (!known && !config.withoutCameraInfo()) return result;
+  const CameraInfo info = known ? *known : config.assumedInfo();
+  const std::string& frame = config.lens.frame.empty() ? info.frame_id : config.lens.frame;
   const std::string outcome = "camera " + rig_.cameras[camera].name + " sees nothing (status 2)";
-  const std::optional<Transform> T_camera_lidar = extrinsics(info->frame_id, lidar_frame, outcome);
+  const std::optional<Transform> T_camera_lidar = extrinsics(frame, lidar_frame, outcome);
   if (!T_camera_lidar) return result;
   result.T_camera_lidar = *T_camera_lidar;
-  result.model = model(camera, *info);
+  result.model = model(camera, info);
   return result;
 }
 
@@ -327,8 +331,7 @@ std::shared_ptr<const CameraModel> BagFusion::model(std::size_t camera, const Ca
   const CameraConfig& config = rig_.cameras[camera];
   std::shared_ptr<const CameraModel> result;
   try {
-    result = std::make_shared<const CameraModel>(
-        info, CameraModelOptions{config.rectified, config.max_theta_deg});
+    result = std::make_shared<const CameraModel>(info, config.modelOptions());
   } catch (const DataError& e) {
     drops_.count("camera " + config.name + ": unusable camera_info",
                  inputTopic(config, config.camera_info) + ": " + e.what());

@@ -16,6 +16,7 @@
 
 #include "edge/lidar_decoder.h"
 #include "edge/tf_pose_source.h"
+#include "semantic_lidar_fusion/fusion/calibration_notes.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 #include "tools/common/bag_input.h"
@@ -93,6 +94,7 @@ class BagFusion {
   DriveIndex index_;
   std::vector<Scan> scans_;
   std::vector<CameraState> cameras_;
+  CalibrationNotes calibration_notes_;
   std::set<std::string> told_notes_;
   std::map<std::pair<std::string, std::string>, std::optional<Transform>> extrinsics_;
   PointCounters points_;

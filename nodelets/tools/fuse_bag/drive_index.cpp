@@ -131,7 +131,7 @@ class Router {
     const std::string info = findTopic(input_, inputTopic(camera, camera.camera_info),
                                        "sensor_msgs/CameraInfo", name, &problem);
     if (info.empty()) {
-      DropLog::warn(problem);
+      if (!camera.withoutCameraInfo()) DropLog::warn(problem);
       return;
     }
     handlers_[info].push_back([track](const rosbag::MessageInstance& m) {

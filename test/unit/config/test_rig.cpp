@@ -11,6 +11,7 @@
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 #include "semantic_lidar_fusion/config/rig.h"
+#include "temporary_folder.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -393,6 +394,17 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
            {"[{name: A0, score_scale: 0}]", "rig.yaml: cameras.A0.score_scale = 0: must not be 0"},
            {"[{name: A0, score_offset: .nan}]", "rig.yaml: cameras.A0.score_offset = .nan: must"},
            {"[{name: A0, max_theta_deg: 181}]", "rig.yaml: cameras.A0.max_theta_deg = 181: must"},
+           {"[{name: A0, lens: {file: no.yaml}}]",
+            "rig.yaml: cameras.A0.lens.file = no.yaml: must be a readable file; '"},
+           {"[{name: A0, lens: {camera: cam0}}]",
+            "rig.yaml: cameras.A0.lens.file = (missing): must be given with `camera` and"},
+           {"[{name: A0, shutter: {readout_s: 2}}]",
+            "rig.yaml: cameras.A0.shutter.readout_s = 2: must be a number from 0 to 1"},
+           {"[{name: A0, shutter: {direction: sideways}}]",
+            "rig.yaml: cameras.A0.shutter.direction = sideways: must be one of down, up, right, "
+            "left"},
+           {"[{name: A0, shutter: {stamp_row: 5}}]",
+            "rig.yaml: cameras.A0.shutter.stamp_row = 5: must be one of first, middle, last"},
            {"[{name: A0, time_offset: 1e10}]", "rig.yaml: cameras.A0.time_offset = 1e10: must be"},
            {"[{name: A0, max_time_difference: -1}]", "rig.yaml: cameras.A0.max_time_difference ="},
            {"[{name: A0, timeout: 0}]", "rig.yaml: cameras.A0.timeout = 0: must be a number above"},
@@ -406,6 +418,42 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
     const std::string problem = problemOf(cameras + bad.text);
     EXPECT_EQ(problem.find(bad.problem), 0u) << bad.text << "\n" << problem;
   }
+}
+
+TEST(RigTest, ReadsLensFilesAndShutters) {
+  const TemporaryFolder folder;
+  const std::string path = folder.path() + "/lens.yaml";
+  std::ofstream(path) << "{model: ucm, resolution: [640, 480], focal: [500, 510], "
+                         "centre: [320, 240], coefficients: [0.6]}\n";
+  const std::string lens = "lens: {file: " + path + ", frame: /left_optical}";
+  const Rig rig = parse("classes: classes_usyd12.yaml\ncameras: [{name: a, " + lens +
+                        ", shutter: {readout_s: 0.02, direction: left, stamp_row: last}}]");
+  const CameraConfig& camera = rig.cameras.at(0);
+  EXPECT_EQ(camera.lens.frame, "left_optical");
+  EXPECT_EQ(camera.shutter.readout_s, 0.02);
+  EXPECT_EQ(camera.shutter.direction, ShutterDirection::kLeft);
+  EXPECT_EQ(camera.shutter.stamp_row, StampRow::kLast);
+  EXPECT_TRUE(camera.withoutCameraInfo());
+  const CameraModel model(camera.assumedInfo(), camera.modelOptions());
+  EXPECT_EQ(model.imageSize(), (ImageSize{640, 480}));
+  EXPECT_EQ(model.fy(), 510.0);
+  EXPECT_TRUE(model.rollingShutter());
+  EXPECT_EQ(rigFromYaml(parseYaml(rig.yaml, "x"), "/nowhere", "x.yaml").yaml, rig.yaml);
+  EXPECT_EQ(
+      problemOf("classes: classes_usyd12.yaml\ncameras: [{name: A0, lens: {file: usyd.yaml}}]")
+          .find("rig.yaml: lens of " + kConfigFolder + "/usyd.yaml: must be a Kalibr camchain"),
+      0u);
+  // What the file breaks is said with its own name, and it replaces camera_info of raw images only.
+  EXPECT_EQ(
+      problemOf("classes: classes_usyd12.yaml\ncameras: [{name: a, rectified: true, " + lens + "}]")
+          .find("rig.yaml: cameras.a.lens = (a map of 2): must be left out where `rectified`"),
+      0u);
+  std::ofstream(path) << "{model: ucm, resolution: [640, 480], focal: [500, 510], "
+                         "centre: [320, 240], coefficients: [1.6]}\n";
+  const std::string problem =
+      problemOf("classes: classes_usyd12.yaml\ncameras: [{name: a, " + lens + "}]");
+  EXPECT_NE(problem.find(path + ": coefficients: alpha = 1.6: must lie in 0..1"), std::string::npos)
+      << problem;
 }
 
 TEST(RigTest, SaysTheResolvedPathOfAMissingFile) {
