@@ -191,7 +191,8 @@ CameraView ScanPipeline::view(std::size_t index, const CameraPlace& place,
   view.image_ns = imageTime(index, image->stamp);
   view.semantics = image->semantics;
   view.has_image = true;
-  if (!rig_.motion_enabled || view.image_ns == reference_ns) return view;
+  const bool rolling = place.model->rollingShutter();
+  if (!rig_.motion_enabled || (view.image_ns == reference_ns && !rolling)) return view;
 
   const std::optional<Transform> T_vehicle_image_vehicle_reference =
       vehicleMotion(odometry, reference_ns, view.image_ns, rig_.compensationConfig());
@@ -201,6 +202,11 @@ CameraView ScanPipeline::view(std::size_t index, const CameraPlace& place,
   }
   const Transform T_camera_vehicle =
       place.T_camera_lidar * T_vehicle_lidar->inverse(Eigen::Isometry);
+  if (rolling) {
+    const std::optional<Twist> vehicle_twist = odometry.twist(view.image_ns);
+    if (vehicle_twist) view.motion = twistOf(T_camera_vehicle, *vehicle_twist);
+  }
+  if (view.image_ns == reference_ns) return view;
   view.T_camera_lidar = T_camera_vehicle * *T_vehicle_image_vehicle_reference * *T_vehicle_lidar;
   return view;
 }

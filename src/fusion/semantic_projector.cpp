@@ -264,9 +264,10 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
   const CameraModel& model = *view.model;
   const ImageSize& size = model.imageSize();
   const double margin_px = castMarginPx(model, grid, config.occlusion);
-  const ProjectedPoints points = projectCloud(cloud, view.T_camera_lidar, model, margin_px);
+  const Twist* motion = view.motion ? &*view.motion : nullptr;
+  const ProjectedPoints points = projectCloud(cloud, view.T_camera_lidar, model, margin_px, motion);
   const std::vector<std::uint8_t> visible =
-      visiblePoints(cloud, points, view.T_camera_lidar, model, grid, config.occlusion);
+      visiblePoints(cloud, points, view.T_camera_lidar, model, grid, config.occlusion, motion);
 
   const EgoMask mask(view.ego_mask, size);
   CameraVotes& votes = outcome->votes;

@@ -16,6 +16,7 @@ constexpr double kFastestTurnRadS = 20.0;
 /// A vehicle does not go to and fro by this way between three readings.
 constexpr double kToAndFroM = 0.3;
 constexpr StampNs kToAndFroNs = 500000000;
+constexpr StampNs kLeastTwistSpan_ns = 10000000;
 
 bool isBefore(const StampedPose& reading, StampNs t) { return reading.stamp < t; }
 
@@ -157,6 +158,30 @@ std::optional<Transform> PoseBuffer::lookup(StampNs t) const {
   const double fraction =
       static_cast<double>(t - before->stamp) / static_cast<double>(after->stamp - before->stamp);
   return interpolate(before->T_fixed_vehicle, after->T_fixed_vehicle, fraction);
+}
+
+std::optional<Twist> PoseBuffer::twist(StampNs t) const {
+  if (!covers(t)) return std::nullopt;
+  const Stretch stretch = stretchAround(t);
+  if (stretch.end - stretch.begin < 2) return std::nullopt;
+  const std::deque<StampedPose>::const_iterator first =
+      readings_.begin() + static_cast<std::ptrdiff_t>(stretch.begin);
+  std::deque<StampedPose>::const_iterator after = atOrAfter(readings_, t);
+  if (after == first) ++after;
+  const StampNs latest = std::min(t, after->stamp - kLeastTwistSpan_ns);
+  auto before = std::upper_bound(first, after, latest,
+                                 [](StampNs time, const StampedPose& r) { return time < r.stamp; });
+  if (before != first) --before;
+  const double span_s = toSeconds(after->stamp - before->stamp);
+  const Transform& a = before->T_fixed_vehicle;
+  const Transform& b = after->T_fixed_vehicle;
+  const Eigen::AngleAxisd turned(Eigen::Matrix3d(a.linear().transpose() * b.linear()));
+  // A constant twist moves along a chord that points as the vehicle does half-way.
+  const Transform middle = interpolate(a, b, 0.5);
+  Twist result;
+  result.turn = turned.axis() * (turned.angle() / span_s);
+  result.velocity = middle.linear().transpose() * (b.translation() - a.translation()) / span_s;
+  return result;
 }
 
 std::optional<Transform> PoseBuffer::closest(StampNs t) const {

@@ -55,12 +55,13 @@ double castMarginPx(const CameraModel& camera, const BeamGrid& grid,
 
 std::vector<std::uint8_t> visiblePoints(const Cloud& cloud, const ProjectedPoints& points,
                                         const Transform& T_camera_lidar, const CameraModel& camera,
-                                        const BeamGrid& grid, const OcclusionConfig& config) {
+                                        const BeamGrid& grid, const OcclusionConfig& config,
+                                        const Twist* motion) {
   if (config.mode->needs == OcclusionMode::Needs::kLinks && grid.links.size() != cloud.size()) {
     throw DataError("beam grid of " + std::to_string(grid.links.size()) + " points for " +
                     std::to_string(cloud.size()) + ": must be that of the same cloud");
   }
-  return config.mode->visible({cloud, points, T_camera_lidar, camera, grid, config});
+  return config.mode->visible({cloud, points, T_camera_lidar, camera, grid, config, motion});
 }
 
 }  // namespace semantic_lidar_fusion

@@ -6,6 +6,8 @@
 #include <limits>
 #include <numeric>
 
+#include "semantic_lidar_fusion/projection/rolling_shutter.h"
+
 namespace semantic_lidar_fusion {
 
 namespace {
@@ -89,6 +91,7 @@ class SurfaceMasks {
         points_(input.points),
         T_camera_lidar_(input.T_camera_lidar),
         camera_(input.camera),
+        motion_(input.motion),
         grid_(input.grid),
         margin_m_(static_cast<float>(input.config.depth_margin_m)),
         margin_ratio_(static_cast<float>(input.config.depth_margin_ratio)),
@@ -133,12 +136,11 @@ class SurfaceMasks {
   /// An arm to a point in the lidar's frame, of which `part` is taken; none if it has no pixel.
   /// Inverse distance is linear in the image on a plane.
   Arm armToPoint(const Sample& own, const Eigen::Vector3f& p_lidar, float part) const {
-    const Eigen::Vector3d p_camera = T_camera_lidar_ * p_lidar.cast<double>();
-    const auto pixel = camera_.project(p_camera);
-    if (!pixel) return {Eigen::Vector2f::Zero(), own.nearness};
-    const double distance = std::max((p_camera - camera_.opticalCentre()).norm(), 1e-3);
+    const auto seen = seePoint(camera_, motion_, T_camera_lidar_ * p_lidar.cast<double>());
+    if (!seen) return {Eigen::Vector2f::Zero(), own.nearness};
+    const double distance = std::max((seen->p_camera - camera_.opticalCentre()).norm(), 1e-3);
     const float nearness = static_cast<float>(1.0 / distance);
-    return {part * (pixel->cast<float>() - own.pixel),
+    return {part * (seen->pixel.cast<float>() - own.pixel),
             own.nearness + part * (nearness - own.nearness)};
   }
 
@@ -253,6 +255,7 @@ class SurfaceMasks {
   const ProjectedPoints& points_;
   const Transform& T_camera_lidar_;
   const CameraModel& camera_;
+  const Twist* motion_;
   const BeamGrid& grid_;
   float margin_m_, margin_ratio_;
   Tiles tiles_;

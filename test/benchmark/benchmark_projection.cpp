@@ -93,6 +93,25 @@ void projectionOurs(benchmark::State& state) {
 }
 BENCHMARK(projectionOurs)->Name("projection/ours")->Unit(benchmark::kMicrosecond);
 
+/// The same with 20 ms of readout at 15 m/s and 30 deg/s.
+void projectionRollingShutter(benchmark::State& state) {
+  CameraModelOptions options;
+  options.shutter.readout_s = 0.02;
+  const CameraModel camera(lens(), options);
+  const Transform T_camera_lidar = cameraFromLidar(0.0);
+  const Twist motion{{0.0, 0.0, 15.0}, {0.0, 30.0 * kPi / 180.0, 0.0}};
+  std::size_t points = 0;
+  for (auto _ : state) {
+    const ProjectedPoints projected = projectCloud(scan(), T_camera_lidar, camera, 0.0, &motion);
+    points = projected.size();
+    benchmark::DoNotOptimize(projected.u.data());
+  }
+  state.counters["in_view"] = static_cast<double>(points);
+}
+BENCHMARK(projectionRollingShutter)
+    ->Name("projection/ours_rolling_shutter")
+    ->Unit(benchmark::kMicrosecond);
+
 void projectionOpencv(benchmark::State& state) {
   const CameraInfo info = lens();
   const Transform T_camera_lidar = cameraFromLidar(0.0);

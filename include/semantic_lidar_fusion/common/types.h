@@ -29,6 +29,25 @@ inline StampNs toNs(double duration_s) {
   return static_cast<StampNs>(std::llround(duration_s * 1e9));
 }
 
+/// Motion of a body relative to the fixed world, in the body's own axes.
+struct Twist {
+  Eigen::Vector3d velocity = Eigen::Vector3d::Zero();  ///< of the body's origin, m/s
+  Eigen::Vector3d turn = Eigen::Vector3d::Zero();      ///< rad/s
+};
+
+/// Where a point `p` that stands still in the world is in the body's axes `t_s` later, to the
+/// second order of the body's motion.
+inline Eigen::Vector3d seenLater(const Eigen::Vector3d& p, const Twist& twist, double t_s) {
+  const Eigen::Vector3d flow = twist.velocity + twist.turn.cross(p);
+  return p - t_s * flow + 0.5 * t_s * t_s * twist.turn.cross(flow);
+}
+
+/// The twist of a body that is fixed to another one.
+inline Twist twistOf(const Transform& T_body_other, const Twist& other) {
+  const Eigen::Vector3d turn = T_body_other.linear() * other.turn;
+  return {T_body_other.linear() * other.velocity + T_body_other.translation().cross(turn), turn};
+}
+
 struct ImageSize {
   int width = 0;
   int height = 0;

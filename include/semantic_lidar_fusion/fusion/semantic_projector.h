@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <memory>
 #include <opencv2/core.hpp>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -40,6 +41,8 @@ struct CameraView {
   bool has_image = false;  ///< an image in time, with odometry and semantics
   StampNs image_ns = 0;    ///< true time of the image
   Transform T_camera_lidar = Transform::Identity();  ///< lidar at t_ref to camera at image_ns
+  /// The camera's at image_ns, for a rolling shutter; empty: it stands still, or is not known.
+  std::optional<Twist> motion;
   ImageSemantics semantics;
 };
 

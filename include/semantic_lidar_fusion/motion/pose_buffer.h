@@ -58,6 +58,10 @@ class PoseBuffer {
   bool covers(StampNs t) const;
   /// Interpolated between the two readings around `t`; empty if not covered.
   std::optional<Transform> lookup(StampNs t) const;
+  /// The vehicle's mean twist about `t`: between the reading at or after `t` and one at or before
+  /// it, at least 10 ms apart if there is one, so that the noise of fast odometry does not become
+  /// speed. Later readings do not change it. Empty if `t` is not covered, or by one reading only.
+  std::optional<Twist> twist(StampNs t) const;
   /// The reading nearest in time, the earlier of two; empty if `t` is not covered.
   std::optional<Transform> closest(StampNs t) const;
 

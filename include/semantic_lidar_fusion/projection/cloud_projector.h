@@ -22,8 +22,10 @@ struct ProjectedPoints {
 
 /// Projects the points of `cloud` that have odometry. `T_camera_lidar` takes the lidar at the
 /// cloud's stamp to the camera at its image's time. Pixels up to `margin_px` outside the image are
-/// kept.
+/// kept. `motion`: of the camera at that time, for a rolling shutter (see rolling_shutter.h); null
+/// = none.
 ProjectedPoints projectCloud(const Cloud& cloud, const Transform& T_camera_lidar,
-                             const CameraModel& camera, double margin_px);
+                             const CameraModel& camera, double margin_px,
+                             const Twist* motion = nullptr);
 
 }  // namespace semantic_lidar_fusion

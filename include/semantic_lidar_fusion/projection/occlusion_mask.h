@@ -38,6 +38,7 @@ struct MaskInput {
   const CameraModel& camera;
   const BeamGrid& grid;  ///< of the same cloud
   const OcclusionConfig& config;
+  const Twist* motion;  ///< of the camera, for a rolling shutter; null = none
 };
 
 /// Pixels beyond the image within which points may cast into it.
@@ -47,6 +48,7 @@ double castMarginPx(const CameraModel& camera, const BeamGrid& grid, const Occlu
 /// DataError if the mode needs links and `grid` is not that of `cloud`.
 std::vector<std::uint8_t> visiblePoints(const Cloud& cloud, const ProjectedPoints& points,
                                         const Transform& T_camera_lidar, const CameraModel& camera,
-                                        const BeamGrid& grid, const OcclusionConfig& config);
+                                        const BeamGrid& grid, const OcclusionConfig& config,
+                                        const Twist* motion = nullptr);
 
 }  // namespace semantic_lidar_fusion

@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 #include <yaml-cpp/yaml.h>
 
+#include <cmath>
 #include <fstream>
 #include <memory>
 #include <random>
@@ -133,6 +134,47 @@ TEST(ScanPipelineTest, UnknownExtrinsicsOfTheLidarMeanNoOdometry) {
       still.compensate(scan(), kStart + 50 * kMs, PoseBuffer(), std::nullopt);
   EXPECT_TRUE(allHave(measured.cloud, PointStatus::kFused));
   EXPECT_EQ(measured.cloud.x, scan().x);
+}
+
+TEST(ScanPipelineTest, ARollingShutterGetsTheMotionOfItsCamera) {
+  const ScanPipeline pipeline(rig(), {PipelineStep::kView});
+  const Transform T_vehicle_lidar = mounted(1.0, 0.1), T_camera_lidar = mounted(-0.4, 1.2);
+  CameraInfo info;
+  info.size = {640, 400};
+  info.k = {300, 0, 320, 0, 300, 200, 0, 0, 1};
+  CameraModelOptions rolling;
+  rolling.shutter.readout_s = 0.02;
+  const CameraPlace place{std::make_shared<const CameraModel>(info, rolling), T_camera_lidar};
+  const StampNs t_image = kStart + 33 * kMs;
+  const SegmentedImage seen = image(1, t_image);
+  const auto cameraAt = [&](StampNs t) {
+    return Transform(poseAt(t) * T_vehicle_lidar * T_camera_lidar.inverse(Eigen::Isometry));
+  };
+  // Also where the image is taken at the reference time.
+  for (const StampNs reference : {t_image, kStart + 50 * kMs}) {
+    const CameraView view = pipeline.view(0, place, &seen, reference, drive(), T_vehicle_lidar);
+    ASSERT_TRUE(view.has_image && view.motion);
+    const Eigen::Vector3d p(3.0, -2.0, 12.0);
+    for (const int ms : {-20, 5, 20}) {
+      const Eigen::Vector3d later =
+          cameraAt(t_image + ms * kMs).inverse(Eigen::Isometry) * (cameraAt(t_image) * p);
+      // poseAt() keeps its direction in the world, not in the vehicle: v w dt^2 / 2 apart, and the
+      // twist is that of 2 ms later.
+      const double dt = 1e-3 * ms;
+      EXPECT_LT((seenLater(p, *view.motion, dt) - later).norm(),
+                1.1 * (0.5 * 10.0 * 0.5 * dt * dt + 10.0 * 0.5 * 0.002 * std::abs(dt)))
+          << ms;
+    }
+  }
+  EXPECT_FALSE(
+      pipeline.view(0, {pinhole(), T_camera_lidar}, &seen, t_image, drive(), T_vehicle_lidar)
+          .motion);
+  // Not known to move, not known where its rows were.
+  EXPECT_FALSE(pipeline.view(0, place, &seen, t_image, PoseBuffer(), T_vehicle_lidar).has_image);
+  const ScanPipeline still(rig("motion: {enabled: false}\n"), {PipelineStep::kView});
+  const CameraView standing = still.view(0, place, &seen, t_image, PoseBuffer(), std::nullopt);
+  EXPECT_TRUE(standing.has_image);
+  EXPECT_FALSE(standing.motion);
 }
 
 TEST(ScanPipelineTest, AViewMovesWithTheVehicleToTheTimeOfItsImage) {

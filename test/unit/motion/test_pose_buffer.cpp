@@ -105,6 +105,50 @@ TEST(PoseBuffer, InterpolatesAcrossAGap) {
   EXPECT_NEAR(buffer.lookup(5010)->translation().x(), 1.5, 1e-12);
 }
 
+TEST(PoseBuffer, TwistIsThatOfAConstantDrive) {
+  // 15 m/s along the vehicle's own x, 30 deg/s: the exponential of a constant twist, on a circle of
+  // radius v / w.
+  const double v = 15.0, w = 30.0 * kPi / 180.0, radius = v / w;
+  const auto at = [&](StampNs t) {
+    const double a = w * toSeconds(t);
+    Transform T = Transform::Identity();
+    T.linear() = Eigen::AngleAxisd(a, Eigen::Vector3d::UnitZ()).toRotationMatrix();
+    T.translation() = Eigen::Vector3d(radius * std::sin(a), radius * (1.0 - std::cos(a)), 0.0);
+    return T;
+  };
+  for (const StampNs period : {StampNs{1000000}, StampNs{10000000}, StampNs{50000000}}) {
+    PoseBuffer buffer;
+    for (StampNs t = 0; t <= 20 * period; t += period) buffer.add({t, at(t)});
+    for (const StampNs t : {StampNs{0}, 5 * period + 1, 7 * period, 20 * period}) {
+      const auto twist = buffer.twist(t);
+      ASSERT_TRUE(twist);
+      // A chord is shorter than its arc by (w dt)^2 / 24.
+      EXPECT_NEAR(twist->velocity.x(), v, 1e-3);
+      EXPECT_NEAR(twist->velocity.y(), 0.0, 1e-6);
+      EXPECT_NEAR(twist->turn.z(), w, 1e-9);
+    }
+    EXPECT_FALSE(buffer.twist(-1));
+    EXPECT_FALSE(buffer.twist(20 * period + 1));
+  }
+}
+
+TEST(PoseBuffer, TwistOfFastReadingsSpansTenMillisecondsAndLaterOnesDoNotChangeIt) {
+  // Noise of 1 mm at 1 kHz would be 1 m/s between neighbours.
+  PoseBuffer buffer;
+  for (StampNs t = 0; t <= 40; ++t) {
+    buffer.add({t * 1000000, pose(0.01 * static_cast<double>(t) + (t % 2 == 0 ? 1e-3 : 0.0), 0.0)});
+  }
+  const auto twist = buffer.twist(20500000);
+  ASSERT_TRUE(twist);
+  // From 11 to 21 ms: both odd.
+  EXPECT_NEAR(twist->velocity.x(), 10.0, 1e-9);
+  buffer.add({41000000, pose(99.0, 0.0)});
+  EXPECT_EQ(buffer.twist(20500000)->velocity, twist->velocity);
+  PoseBuffer single;
+  single.add({5, pose(1.0, 0.0)});
+  EXPECT_FALSE(single.twist(5));
+}
+
 TEST(PoseBuffer, ForgetsWhatIsOlderThanItsHistory) {
   PoseBuffer buffer(100);
   for (StampNs stamp = 0; stamp <= 1000; stamp += 10) buffer.add({stamp, pose(0.0, 0.0)});
