@@ -58,6 +58,7 @@ class CameraConfig(NamedTuple):
     camera_info: str
     scores: str
     rectified: bool
+    lens: Dict[str, str]  # file, camera and frame, empty texts where camera_info has it all
     timeout_s: float
 
 
@@ -155,6 +156,7 @@ class Rig:
                 topic("camera_info"),
                 topic("scores"),
                 bool(entry["rectified"]),
+                {str(key): str(value) for key, value in entry.get("lens", {}).items()},
                 float(entry["timeout"]),
             )
         except (KeyError, TypeError, ValueError) as error:

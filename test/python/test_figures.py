@@ -8,6 +8,7 @@ import pytest
 
 bag_factory = pytest.importorskip("bag_factory")
 cv2 = pytest.importorskip("cv2")
+pytest.importorskip("semantic_lidar_fusion._cameras", reason="built with pybind11 only")
 from bag_factory import CLASS_NAMES, Drive  # noqa: E402
 from semantic_lidar_fusion.rig import Rig  # noqa: E402
 from semantic_lidar_fusion.figures import paper_figures  # noqa: E402
@@ -89,6 +90,30 @@ def test_rectified_images_use_p():
     np.testing.assert_allclose(pixel[0], [(210 + 1240 - 42) / 4, (-84 + 920 + 21) / 4])
     with pytest.raises(DataError, match="mei"):
         Camera(info("mei", []))
+
+
+def test_rays_lead_back_through_a_lens_file(tmp_path):
+    path = tmp_path / "lens.yaml"
+    path.write_text(
+        "{model: double_sphere, resolution: [640, 480], focal: [300, 310], "
+        "centre: [320, 240], coefficients: [-0.27, 0.57]}"
+    )
+    camera = Camera(info("whatever", [1.0]), lens={"file": str(path), "frame": "left"})
+    assert camera.frame_id == "left" and camera.size == (640, 480)
+    points = points_ahead(0.6)
+    pixel, inside = camera.project(points)
+    assert inside.sum() > 200
+    # The paper's equations.
+    d1 = np.linalg.norm(points, axis=1)
+    z = -0.27 * d1 + points[:, 2]
+    d2 = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2 + z**2)
+    plane = points[:, :2] / (0.57 * d2 + 0.43 * z)[:, None]
+    np.testing.assert_allclose(pixel, plane * [300, 310] + [320, 240], atol=1e-9)
+    np.testing.assert_allclose(camera.rays(pixel), points / d1[:, None], atol=1e-9)
+    assert np.isnan(camera.project(np.array([[0.0, 0.0, -1.0]]))[0]).all()
+    path.write_text("{model: ds}")
+    with pytest.raises(DataError, match="model = 'ds': must be one of|must be given"):
+        Camera(info("", []), lens={"file": str(path)})
 
 
 def test_boundaries_of_superpixels():

@@ -208,10 +208,14 @@ def _load_view(
         order = [entry.image, entry.image + "/compressed"]
         message = _last_at(bags, order, stamp_ns)
         got["image"] = None if message is None else rgb_of(message)
+    from sensor_msgs.msg import CameraInfo
+
     camera, to_camera, to_vehicle = None, None, None
     info = _info(bags, entry.camera_info, stamp_ns)
+    if info is None and entry.lens.get("frame"):  # needs no camera_info
+        info = CameraInfo()
     if info is not None and stamp_ns:
-        camera = Camera(info, entry.rectified)
+        camera = Camera(info, entry.rectified, entry.lens)
         to_camera = _to_camera(tree, rig, camera.frame_id, cloud, stamp_ns)
         to_vehicle = _static(tree, rig.text("vehicle_frame"), camera.frame_id)
     return View(

@@ -106,8 +106,10 @@ class CameraSample:
         if self.info is None:
             return None
         try:
-            return Camera(self.info, bool(self.config.get("rectified", False)))
-        except (DataError, np.linalg.LinAlgError) as error:
+            return Camera(
+                self.info, bool(self.config.get("rectified", False)), self.config.get("lens")
+            )
+        except DataError as error:
             if str(error) not in self.problems:
                 self.problems.append(str(error))
             return None

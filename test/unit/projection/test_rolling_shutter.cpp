@@ -292,7 +292,7 @@ TEST(RollingShutter, MasksAreCastWhereTheRowsSawTheSurface) {
   Cloud cloud = cloudOf(points);
   cloud.ring = rings;
   OcclusionConfig config;
-  config.mode = OcclusionMode::kAdaptive;
+  config.mode = &OcclusionMode::kAdaptive;
   const BeamGrid grid = beamGrid(cloud, config);
   const auto projected = projectCloud(cloud, T_camera_lidar, camera, 100.0, &twist);
   const auto visible =
