@@ -79,7 +79,7 @@ void checkSemantics(const std::string& camera, const ImageSemantics& semantics, 
   }
 }
 
-void checkViews(const std::vector<CameraView>& views, int class_count) {
+void checkViews(const std::vector<CameraView>& views, std::size_t points, int class_count) {
   unsigned used = 0;
   for (std::size_t i = 0; i < views.size(); ++i) {
     const CameraView& view = views[i];
@@ -97,6 +97,10 @@ void checkViews(const std::vector<CameraView>& views, int class_count) {
     if (!view.ego_mask.empty() && view.ego_mask.type() != CV_8UC1) {
       throw DataError(camera + "mask is " + describe(view.ego_mask) +
                       ", must be 8-bit (0) with 1 channel");
+    }
+    if (!view.known_visible.empty() && view.known_visible.size() != points) {
+      throw DataError(camera + "visibility of " + std::to_string(view.known_visible.size()) +
+                      " points is known, the cloud has " + std::to_string(points));
     }
     if (!view.T_camera_lidar_static.matrix().allFinite() ||
         !view.T_camera_lidar.matrix().allFinite()) {
@@ -266,8 +270,13 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
   const double margin_px = castMarginPx(model, grid, config.occlusion);
   const Twist* motion = view.motion ? &*view.motion : nullptr;
   const ProjectedPoints points = projectCloud(cloud, view.T_camera_lidar, model, margin_px, motion);
-  const std::vector<std::uint8_t> visible =
-      visiblePoints(cloud, points, view.T_camera_lidar, model, grid, config.occlusion, motion);
+  std::vector<std::uint8_t> visible;
+  if (view.known_visible.empty()) {
+    visible =
+        visiblePoints(cloud, points, view.T_camera_lidar, model, grid, config.occlusion, motion);
+  } else {
+    for (const std::uint32_t i : points.index) visible.push_back(view.known_visible[i]);
+  }
 
   const EgoMask mask(view.ego_mask, size);
   CameraVotes& votes = outcome->votes;
@@ -405,7 +414,7 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
                                      bool with_pixels) const {
   std::sort(views.begin(), views.end(),
             [](const CameraView& a, const CameraView& b) { return a.name < b.name; });
-  checkViews(views, config_.class_count);
+  checkViews(views, cloud.size(), config_.class_count);
 
   FusionResult result;
   result.cloud.points = cloud;

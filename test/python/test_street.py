@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The whole chain on the simulated street: exact where it can be, better step by step elsewhere."""
 
+import csv
 import os
 import subprocess
 
@@ -75,3 +76,35 @@ def test_each_step_helps_on_a_fast_drive(tmp_path):
     present = last.support > 100
     assert present.sum() >= 6
     assert (last.f1[present] > first.f1[present]).all()
+
+
+def test_bounds_take_visibility_and_odometry_from_the_truth(tmp_path, run_command):
+    """With the true visibility no camera labels what it does not see, and misses nothing of what
+    lies in its image and it sees; F1* can only gain by it where the network is perfect."""
+    bag, out = tmp_path / "drive.bag", tmp_path / "out"
+    simulate = [PROGRAMS[0], "--out", bag, "--duration", "0.3", "--scale", "0.3", "--quiet"]
+    run(*(simulate + ["--perfect-network", "--static"]))
+    code, text, err = run_command(
+        "evaluate.py", bag, "--rig", RIG, "--bounds", "--keep-bags", "--out", out
+    )
+    assert code == 0, err
+    with open(str(out / "summary.csv")) as file:
+        counts = {row["configuration"]: row for row in csv.DictReader(file)}
+    assert list(counts)[3:] == ["package", "true_visibility", "true_odometry", "true_both"]
+    star = {name: float(row["mean_f1_star"]) for name, row in counts.items()}
+    assert star["motion_mask"] < star["package"] < star["true_visibility"]
+    # The simulated odometry is good: to know it exactly moves a few points over a border.
+    assert star["true_both"] == pytest.approx(star["true_visibility"], abs=0.002)
+    assert star["true_both"] > 0.97
+    rig = Rig.load(RIG)
+    truth = scoring.Truth(str(bag), len(rig.labels))
+    clouds = scoring.FusedBag(str(out / "true_both.bag"), rig.labels.names)
+    seen = 0
+    for _, cloud, scan in scoring.paired(truth, clouds):
+        visible, bits = scan.flags("visible"), cloud.optional("cameras")
+        assert not (bits & ~visible).any()
+        seen += int((bits != 0).sum())
+        # At a border a point may be on either side: projections differ by rounding.
+        assert ((visible & ~bits) != 0).mean() < 0.001
+    assert seen > 10000
+    assert "true_both: F1*" in text

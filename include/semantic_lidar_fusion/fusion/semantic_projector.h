@@ -44,6 +44,9 @@ struct CameraView {
   /// The camera's at image_ns, for a rolling shutter; empty: it stands still, or is not known.
   std::optional<Twist> motion;
   ImageSemantics semantics;
+  /// Of each point of the cloud whether the camera sees it, where that is known; empty: the
+  /// occlusion mask decides.
+  std::vector<std::uint8_t> known_visible;
 };
 
 struct FusionConfig {
@@ -89,7 +92,7 @@ class SemanticProjector {
   /// The order of `views` does not matter, nor does the number of threads. `with_pixels`: fill the
   /// arrays of the reports, which cost more than the rest of the transfer. Throws DataError if
   /// names or rig indices repeat, if a view's scores, share, probabilities or mask do not fit the
-  /// configuration, or as beamGrid does.
+  /// configuration, if `known_visible` is not as long as the cloud, or as beamGrid does.
   FusionResult fuse(const Cloud& cloud, std::vector<CameraView> views,
                     bool with_pixels = true) const;
 

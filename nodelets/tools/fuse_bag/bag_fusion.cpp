@@ -71,6 +71,7 @@ void BagFusion::run() {
 
 void BagFusion::fuseInto(BagOutput* output) {
   index_ = indexDrive(input_, rig_, &poses_, &drops_, !options_.quiet, checkpoint_);
+  if (options_.true_visibility) truth_.emplace(input_, toNs(rig_.lidar.time_offset_s));
   measureScans();
   select();
   fuseScans(output);
@@ -253,6 +254,7 @@ void BagFusion::fuseScan(const Scan& scan, BagOutput* output) {
     }
   }
   for (const std::string& note : calibration_notes_.news(rig_, views)) DropLog::warn(note);
+  if (truth_) truth_->apply(scan_ns, rigid.cloud.size(), &views);
   const FusionResult result = pipeline_.fuse(rigid.cloud, views, options_.all);
   if (!result.note.empty() && told_notes_.insert(result.note).second && !options_.quiet) {
     DropLog::note(result.note);

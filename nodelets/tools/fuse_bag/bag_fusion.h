@@ -24,6 +24,7 @@
 #include "tools/common/drop_log.h"
 #include "tools/fuse_bag/drive_index.h"
 #include "tools/fuse_bag/fuse_bag_options.h"
+#include "tools/fuse_bag/truth.h"
 
 namespace semantic_lidar_fusion {
 
@@ -92,6 +93,7 @@ class BagFusion {
   BagInput input_;
   TfPoseSource poses_;
   DriveIndex index_;
+  std::optional<VisibilityTruth> truth_;
   std::vector<Scan> scans_;
   std::vector<CameraState> cameras_;
   CalibrationNotes calibration_notes_;

@@ -20,6 +20,8 @@ options:
   --all            also write for each camera superpixels, share, probabilities, scores (where the
                    package's own network made them), projection_overlay and uncertainty_overlay
   --tf             also copy /tf and /tf_static to OUT.bag
+  --truth visibility
+                   let the bag's /points_truth, and no mask, say which camera sees which point
   --force          replace OUT.bag whatever it is; without, an earlier output only
   --quiet          no progress and no summary
   --print-rig      print the rig file with --set applied and every default filled in, and end; the
@@ -42,7 +44,7 @@ FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
     }
     const std::size_t equals = argument.find('=');
     const std::string name = argument.substr(0, equals);
-    const bool takes_value = name == "--rig" || name == "--set";
+    const bool takes_value = name == "--rig" || name == "--set" || name == "--truth";
     if (!takes_value && equals != std::string::npos) {
       throw UsageError("unknown option " + argument);
     }
@@ -65,6 +67,9 @@ FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
         throw UsageError("--set " + value + ": KEY=VALUE is wanted");
       }
       options.overrides.push_back(value);
+    } else if (name == "--truth") {
+      if (value != "visibility") throw UsageError("--truth " + value + ": must be visibility");
+      options.true_visibility = true;
     } else if (name == "--all") {
       options.all = true;
     } else if (name == "--tf") {

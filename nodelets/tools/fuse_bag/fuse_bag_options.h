@@ -13,6 +13,7 @@ struct FuseBagOptions {
   std::string output;
   std::string rig;
   std::vector<std::string> overrides;  ///< --set key=value
+  bool true_visibility = false;        ///< --truth visibility
   bool all = false;
   bool tf = false;
   bool force = false;

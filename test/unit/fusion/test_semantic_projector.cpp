@@ -606,6 +606,17 @@ TEST(SemanticProjector, GivesEachStatusItsMeaning) {
   EXPECT_NEAR(report.v[0], 4, 0.02);
 }
 
+TEST(SemanticProjector, KnownVisibilityStandsInForTheMask) {
+  Cloud cloud = handCloud();
+  addPoint(&cloud, pointAt(3, 4, 5));   // said to be hidden
+  addPoint(&cloud, pointAt(3, 4, 9));   // behind it, said to be seen
+  addPoint(&cloud, pointAt(-4, 4, 5));  // left of the image whatever is said
+  CameraView view = handCamera();
+  view.known_visible = {0, 1, 1};
+  const FusionResult result = SemanticProjector(handConfig()).fuse(cloud, {view});
+  EXPECT_EQ(statuses(result), (std::vector<int>{1, 0, 2}));
+}
+
 TEST(SemanticProjector, MaskedPointsCastAndAreOutsideEvenIfHidden) {
   Cloud cloud = handCloud();
   addPoint(&cloud, pointAt(3, 4, 2));  // on the mask
@@ -817,6 +828,9 @@ void expectRefused(const CameraView& view, const std::string& part) {
 TEST(SemanticProjector, RefusesViewsThatDoNotFit) {
   EXPECT_EQ(refusal({handCamera()}), "");
   CameraView view = handCamera();
+  view.known_visible = {1, 1};
+  expectRefused(view, "visibility of 2 points is known, the cloud has 1");
+  view.known_visible.clear();
   view.semantics = {};
   expectRefused(view, "neither");
   view.semantics.scores = ScoreMap(cv::Mat(4, 4, CV_32FC3, cv::Scalar::all(0)), 3, ScoreFormat{});
