@@ -55,7 +55,7 @@ fi
 # ... oracles and peers in tests and benchmarks, the format checks, the fuzzers.
 if [ "$testing" = 1 ]; then
   optional="$optional libopencv-contrib-dev libbenchmark-dev pcl-tools octomap-tools clang
-    python3-venv"
+    mypy python3-venv"
   if [ -d /opt/ros/noetic ]; then
     optional="$optional ros-noetic-pcl-ros"
   else

@@ -188,10 +188,11 @@ def _unique_mapping(loader: _UniqueKeyLoader, node: yaml.MappingNode, deep: bool
     return yaml.SafeLoader.construct_mapping(loader, node, deep)
 
 
-_UniqueKeyLoader.add_constructor(
-    yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG,
-    lambda loader, node: _unique_mapping(loader, node, True),
-)
+def _whole_mapping(loader: _UniqueKeyLoader, node: yaml.MappingNode) -> Any:
+    return _unique_mapping(loader, node, True)
+
+
+_UniqueKeyLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _whole_mapping)
 
 
 MAX_YAML_BYTES = 1 << 20

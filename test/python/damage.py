@@ -296,6 +296,7 @@ def campaign(
                 text = "run %d (%s, %s of %s): %s\n%s"
                 text %= (number, name, kind, case.damaged, fault, outcome.errors[-600:])
                 found.append(text)
+                print(text, file=sys.stderr, flush=True)
         return Summary(len(plan), refused, found, longest, most)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -325,7 +326,6 @@ def main() -> int:
     parser.add_argument("commands", nargs="*", help="only these (default: all)")
     options = parser.parse_args()
     summary = campaign(options.flips, options.cuts, options.seed, options.commands or None, True)
-    print("\n".join(summary.faults))
     print(
         "%d runs, %d refused in one line, %d faults; longest %.1f s, most memory %.0f MB"
         % (

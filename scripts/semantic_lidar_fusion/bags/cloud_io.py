@@ -95,6 +95,16 @@ def _message_dtype(message: Any, step: int) -> np.dtype:
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
 
 
+def names_of(points: np.ndarray) -> Tuple[str, ...]:
+    """The field names of a structured array."""
+    return tuple(points.dtype.names or ())
+
+
+def _fields(points: np.ndarray) -> Dict[str, Tuple[np.dtype, int]]:
+    """Type and offset of each field of a structured array."""
+    return {name: (entry[0], int(entry[1])) for name, entry in (points.dtype.fields or {}).items()}
+
+
 def from_array(points: np.ndarray, stamp_ns: int, frame_id: str) -> Any:
     """A PointCloud2 (height 1) of a structured array (N,), with the array's own layout.
 
@@ -109,8 +119,8 @@ def from_array(points: np.ndarray, stamp_ns: int, frame_id: str) -> Any:
     message.header.stamp = to_stamp(stamp_ns)
     message.header.frame_id = frame_id
     message.height, message.width = 1, len(points)
-    for name in points.dtype.names:
-        kind, offset = points.dtype.fields[name][:2]
+    for name in names_of(points):
+        kind, offset = _fields(points)[name]
         datatype = _DATATYPE_OF.get(kind.base.newbyteorder("="))
         if datatype is None:
             raise ValueError("field %s: %s is no PointCloud2 type" % (name, kind))
@@ -119,7 +129,7 @@ def from_array(points: np.ndarray, stamp_ns: int, frame_id: str) -> Any:
     message.point_step = points.dtype.itemsize
     message.row_step = message.point_step * len(points)
     message.data = points.tobytes()
-    axes = [axis for axis in "xyz" if axis in points.dtype.names]
+    axes = [axis for axis in "xyz" if axis in names_of(points)]
     message.is_dense = all(bool(np.isfinite(points[axis]).all()) for axis in axes)
     return message
 

@@ -220,7 +220,7 @@ class TransformTree:
             raise DataError("tf: %s and %s are not connected" % (target, source))
         valid = np.ones(len(times), dtype=bool)
 
-        def to_common(chain: List[str]) -> np.ndarray:
+        def to_common(chain: List[str], common: str) -> np.ndarray:
             result = np.repeat(np.eye(4)[None], len(times), axis=0)
             for child in chain[: chain.index(common)]:
                 edge, covered = self._edge(child, times)
@@ -228,7 +228,7 @@ class TransformTree:
                 result = edge @ result
             return result
 
-        result = invert(to_common(up_target)) @ to_common(up_source)
+        result = invert(to_common(up_target, common)) @ to_common(up_source, common)
         result[~valid] = np.nan
         return result, valid
 

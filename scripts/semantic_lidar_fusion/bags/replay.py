@@ -190,7 +190,8 @@ def _links_out(name: str) -> Set[Tuple[str, str]]:
     """(listener, topic) of each live connection of a node that runs."""
     try:
         node = _node(name)
-        info = node.getBusInfo(rospy.get_name())[2] if node else []
+        answer: Any = node.getBusInfo(rospy.get_name()) if node else [1, "", []]
+        info = answer[2]
     except (OSError, xmlrpc.client.Error):
         return set()
     return {(e[1], e[4]) for e in info if e[2] == "o" and (len(e) < 6 or e[5])}

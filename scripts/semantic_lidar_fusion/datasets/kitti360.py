@@ -20,7 +20,7 @@ none. Frames that a partial download lacks are left out with a warning.
 import glob
 import os
 import re
-from typing import Callable, Dict, List, NamedTuple, Optional, Sequence, Tuple
+from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -278,7 +278,7 @@ class _Accumulated:
         self._t_pose_velo = t_pose_velo
         self._table = table
         self._loaded = ""
-        self._tree: Optional[object] = None
+        self._tree: Any = None  # scipy tells no types
         self._labels = np.zeros(0, dtype=np.uint8)
 
     def label(self, frame: int, xyz: np.ndarray, times_ns: np.ndarray) -> Optional[np.ndarray]:
@@ -293,9 +293,7 @@ class _Accumulated:
         placed = np.einsum("nij,nj->ni", matrix[which, :3, :3], xyz) + matrix[which, :3, 3]
         known = covered[which] & np.isfinite(placed).all(axis=1)
         label = np.full(len(xyz), NO_LABEL, dtype=np.uint8)
-        distance, index = self._tree.query(  # type: ignore[attr-defined]
-            placed[known], distance_upper_bound=LABEL_REACH_M
-        )
+        distance, index = self._tree.query(placed[known], distance_upper_bound=LABEL_REACH_M)
         near = np.isfinite(distance)
         found = np.full(len(distance), NO_LABEL, dtype=np.uint8)
         found[near] = self._labels[index[near]]

@@ -9,7 +9,7 @@ every point is of that instant, and the rig file disables motion. `base_link` is
 """
 
 import os
-from typing import Callable, Dict, List, Optional, Sequence
+from typing import Callable, Dict, Mapping, List, Optional, Sequence
 
 import numpy as np
 
@@ -169,7 +169,7 @@ def _read_times(path: str) -> List[int]:
     return times
 
 
-def _check_count(files: Dict[int, object], times: List[int], where: str) -> None:
+def _check_count(files: Mapping[int, object], times: List[int], where: str) -> None:
     if sorted(files) != list(range(len(times))):
         gaps = [n for n in range(len(times)) if n not in files]
         raise DataError(

@@ -6,17 +6,18 @@ labels.NO_LABEL marks what has none. All classes add up scan by scan, so that a 
 needs the memory of one scan. A quotient without a denominator is NaN.
 """
 
-from typing import Any, List, Optional
+from typing import Any, List, Optional, Union
 
 import numpy as np
 
 from semantic_lidar_fusion.labels import NO_LABEL
 
 ECE_BINS = 15
+Values = Union[np.ndarray, float]
 MIN_PROBABILITY = 1e-12  # where the NLL is clipped
 
 
-def ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+def ratio(numerator: Values, denominator: Values) -> np.ndarray:
     """numerator / denominator in float64, NaN where the denominator is 0."""
     numerator, denominator = np.broadcast_arrays(
         np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)

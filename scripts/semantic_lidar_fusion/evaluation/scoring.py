@@ -488,13 +488,13 @@ def mask_visibility(
         visible = scan.flags("visible")
         if visible is None:
             return None
-        cameras = [c.optional("cameras") for c in (cloud, with_mask)]
-        if index != other or any(bits is None for bits in cameras):
+        before, after = cloud.optional("cameras"), with_mask.optional("cameras")
+        if index != other or before is None or after is None:
             raise DataError(
                 "%s and %s: not the same scans, or no field cameras" % (unmasked.path, masked.path)
             )
         truths = (scan.flags(name) for name in ("catchable", "silhouette", "apart"))
-        result.add(cameras[0], cameras[1], visible, *truths)
+        result.add(before, after, visible, *truths)
     return result
 
 

@@ -4,7 +4,7 @@ after), fig. 5 (points in the images, without and with the mask), fig. 6 (panora
 """
 
 import os
-from typing import Any, Dict, List, NamedTuple, Optional, Tuple
+from typing import Any, Callable, Dict, List, NamedTuple, Optional, Tuple, TypeVar
 
 import numpy as np
 
@@ -20,8 +20,8 @@ from semantic_lidar_fusion.figures.plotting import title_of
 from semantic_lidar_fusion.bags.poses import TransformTree, invert, transform_points
 from semantic_lidar_fusion.rig import CameraConfig, Rig
 
-FIGURES = ("2", "3", "5", "6")
 _TOP_VIEW_M = 40.0
+T = TypeVar("T")
 
 
 class View(NamedTuple):
@@ -46,6 +46,34 @@ class View(NamedTuple):
         """(h, w) most likely class."""
         values = self.probabilities if self.probabilities is not None else self.scores
         return None if values is None else values.argmax(axis=-1)
+
+    @property
+    def has_uncertainty(self) -> bool:
+        """What figure 2 needs."""
+        needed = (self.image, self.superpixels, self.share, self.labels())
+        return all(value is not None for value in needed)
+
+    @property
+    def has_score_maps(self) -> bool:
+        """What figure 3 needs."""
+        return self.scores is not None and self.probabilities is not None
+
+    @property
+    def has_projection(self) -> bool:
+        """What figure 5 needs."""
+        return self.image is not None and self.camera is not None and self.to_camera is not None
+
+    @property
+    def has_directions(self) -> bool:
+        """What the panorama of figure 6 needs."""
+        return not (self.camera is None or self.to_vehicle is None or self.labels() is None)
+
+
+def _given(value: Optional[T]) -> T:
+    """A part of a view that its caller has checked to be there."""
+    if value is None:
+        raise DataError("a view lacks what its figure needs")
+    return value
 
 
 class Scene(NamedTuple):
@@ -118,13 +146,12 @@ def _last_at(bags: List[BagReader], topics: List[str], stamp_ns: int) -> Any:
     margin = 3 * 10**9
     for topic in topics:
         for bag in bags:
-            for around in (margin, None):
-                window = (
-                    {}
-                    if around is None
-                    else {"start_ns": max(0, stamp_ns - around), "end_ns": stamp_ns + around}
-                )
-                for item in bag.read([topic], **window):
+            windows: List[Tuple[Optional[int], Optional[int]]] = [
+                (max(0, stamp_ns - margin), stamp_ns + margin),
+                (None, None),
+            ]
+            for start_ns, end_ns in windows:
+                for item in bag.read([topic], start_ns=start_ns, end_ns=end_ns):
                     if to_ns(item.message.header.stamp) == stamp_ns:
                         return item.message
     return None
@@ -283,19 +310,20 @@ def _bare(axis: Any) -> None:
 def draw_uncertainty(path: str, view: View, labels: LabelSet) -> None:
     """Figure 2: image, superpixels, labels with superpixels, share."""
     plt = plotting.pyplot()
-    size = view.image.shape[1::-1]
-    superpixels = _resized(view.superpixels, size)
+    image, label = _given(view.image), _given(view.labels())
+    size = (image.shape[1], image.shape[0])
+    superpixels = _resized(_given(view.superpixels), size)
     edge = boundaries(superpixels)
-    colors = labels.colors_rgb[_resized(view.labels(), size)].astype(float)
-    clustered = view.image.astype(float).copy()
+    colors = labels.colors_rgb[_resized(label, size)].astype(float)
+    clustered = image.astype(float).copy()
     clustered[edge] = (255, 230, 0)
-    labelled = 0.75 * colors + 0.25 * view.image
+    labelled = 0.75 * colors + 0.25 * image
     labelled[edge] = 0.35 * labelled[edge]
-    share = _resized(view.share, size)
+    share = _resized(_given(view.share), size)
     aspect = size[1] / size[0]
     width = 3.5
     figure, axes = plt.subplots(2, 2, figsize=(2 * width, 2 * width * aspect + 0.75))
-    pictures = [view.image, clustered, labelled]
+    pictures: List[np.ndarray] = [image, clustered, labelled]
     names = ["(a) image", "(b) superpixels", "(c) labels and superpixels", "(d) share"]
     for axis, picture, name in zip(axes.flat, pictures, names):
         axis.imshow(np.clip(picture, 0, 255).astype(np.uint8), interpolation="antialiased")
@@ -310,7 +338,7 @@ def draw_uncertainty(path: str, view: View, labels: LabelSet) -> None:
     box = last.get_position()
     scale = figure.add_axes([box.x1 + 0.01, box.y0, 0.012, box.height])
     figure.colorbar(drawn, cax=scale)
-    present = np.unique(view.labels())
+    present = np.unique(label)
     handles = [
         plt.Rectangle(
             (0, 0), 1, 1, facecolor=labels.colors_rgb[i] / 255.0, edgecolor="black", lw=0.4
@@ -336,7 +364,8 @@ def draw_score_maps(path: str, view: View, labels: LabelSet) -> None:
     count = len(labels)
     columns = min(count, 6 if count <= 12 else 7 if count <= 14 else 5)
     rows = -(-count // columns)
-    source = view.image.shape if view.image is not None else view.probabilities.shape
+    scores, probabilities = _given(view.scores), _given(view.probabilities)
+    source = view.image.shape if view.image is not None else probabilities.shape
     aspect = source[0] / source[1]
     width = 7.2 / columns
     # One row of headings between and above the halves.
@@ -346,11 +375,11 @@ def draw_score_maps(path: str, view: View, labels: LabelSet) -> None:
     halves = figure.add_gridspec(
         2, 1, hspace=0.5 / half_height, left=0.01, right=0.94, top=1 - 0.4 / height, bottom=0.0
     )
-    low, high = np.percentile(view.scores, (0.5, 99.9))
+    low, high = np.percentile(scores, (0.5, 99.9))
     for half, (values, name, limits) in enumerate(
         (
-            (view.scores, "(a) scores of the network", (low, high)),
-            (view.probabilities, "(b) probabilities after superpixel softmax", (0.0, 1.0)),
+            (scores, "(a) scores of the network", (low, high)),
+            (probabilities, "(b) probabilities after superpixel softmax", (0.0, 1.0)),
         )
     ):
         grid = halves[half].subgridspec(rows, columns, wspace=0.04, hspace=0.2 / (width * aspect))
@@ -386,8 +415,8 @@ class Projected(NamedTuple):
 
 def project_cloud(cloud: SemanticCloud, view: View) -> Projected:
     """Points of the view that are fused or occluded; removed = the mask took this camera away."""
-    points = transform_points(view.to_camera, cloud.xyz)
-    pixel, inside = view.camera.project(points)
+    points = transform_points(_given(view.to_camera), cloud.xyz)
+    pixel, inside = _given(view.camera).project(points)
     inside &= np.isin(cloud.status, (FUSED, OCCLUDED))
     bits = cloud.optional("cameras")
     if bits is None:
@@ -403,9 +432,10 @@ def draw_projection(path: str, scene: Scene) -> None:
     plt = plotting.pyplot()
     from matplotlib.colors import LogNorm
 
-    views = [v for v in scene.views if v.image is not None and v.to_camera is not None]
+    views = [view for view in scene.views if view.has_projection]
+    images = [_given(view.image) for view in views]
     width = 3.55
-    heights = [width * v.image.shape[0] / v.image.shape[1] for v in views]
+    heights = [width * image.shape[0] / image.shape[1] for image in images]
     figure, axes = plt.subplots(
         len(views),
         2,
@@ -414,11 +444,11 @@ def draw_projection(path: str, scene: Scene) -> None:
         gridspec_kw={"height_ratios": heights, "wspace": 0.02, "hspace": 0.24 / np.mean(heights)},
     )
     norm = LogNorm(2.0, 60.0)
-    for row, view in zip(axes, views):
+    for row, view, image in zip(axes, views, images):
         got = project_cloud(scene.cloud, view)
-        gray = view.image.mean(axis=2)[..., None].repeat(3, axis=2)
-        backdrop = (0.55 * view.image + 0.25 * gray + 20).astype(np.uint8)
-        dense = len(got.depth) / (view.image.shape[0] * view.image.shape[1])
+        gray = image.mean(axis=2)[..., None].repeat(3, axis=2)
+        backdrop = (0.55 * image + 0.25 * gray + 20).astype(np.uint8)
+        dense = len(got.depth) / (image.shape[0] * image.shape[1])
         size = float(np.clip(0.004 / max(dense, 1e-6), 0.35, 3.0))
         far_first = np.argsort(-got.depth)
         for axis, masked in zip(row, (False, True)):
@@ -449,8 +479,8 @@ def draw_projection(path: str, scene: Scene) -> None:
                 )
             else:
                 text = "%s, direct" % view.name
-            axis.set_xlim(-0.5, view.image.shape[1] - 0.5)
-            axis.set_ylim(view.image.shape[0] - 0.5, -0.5)
+            axis.set_xlim(-0.5, image.shape[1] - 0.5)
+            axis.set_ylim(image.shape[0] - 0.5, -0.5)
             axis.set_xlabel(text, labelpad=2, fontsize=8)
             _bare(axis)
     scalar = plt.cm.ScalarMappable(norm=norm, cmap="jet_r")
@@ -484,11 +514,7 @@ def panorama(
     About `columns` pixels wide. Returns the picture (h, w, 3) uint8, whether a camera sees each pixel (h, w) bool, and the extent
     [left, right, bottom, top] in deg (azimuth to the left is positive), cut to what is seen. Of
     several cameras the one that sees a direction nearest to its axis gives the pixel."""
-    views = [
-        v
-        for v in scene.views
-        if v.camera is not None and v.to_vehicle is not None and v.labels() is not None
-    ]
+    views = [view for view in scene.views if view.has_directions]
     if not views:
         return None
     coarse = _panorama(scene, views, 720, elevation_deg)
@@ -502,7 +528,7 @@ def _panorama(
     scene: Scene, views: List[View], width: int, elevation_deg: Tuple[float, float]
 ) -> Optional[Tuple[np.ndarray, np.ndarray, List[float]]]:
     """`width`: pixels of 360 deg."""
-    middle = np.mean([v.to_vehicle[:3, 3] for v in views], axis=0)
+    middle = np.mean([_given(v.to_vehicle)[:3, 3] for v in views], axis=0)
     step = 360.0 / width
     azimuth = np.deg2rad(180.0 - (np.arange(width) + 0.5) * step)
     height = int((elevation_deg[1] - elevation_deg[0]) / step)
@@ -512,14 +538,15 @@ def _panorama(
     picture = np.full((height * width, 3), 255.0)
     best = np.full(height * width, np.inf)
     for view in views:
-        local = transform_points(invert(view.to_vehicle), points)
-        pixel, inside = view.camera.project(local)
-        theta = view.camera.theta(local)
+        camera = _given(view.camera)
+        local = transform_points(invert(_given(view.to_vehicle)), points)
+        pixel, inside = camera.project(local)
+        theta = camera.theta(local)
         chosen = np.flatnonzero(inside & (theta < best))
         best[chosen] = theta[chosen]
         u, v = (np.floor(pixel[chosen] + 0.5)).astype(int).T
-        size = view.camera.size
-        label = view.labels()
+        size = camera.size
+        label = _given(view.labels())
         rows, columns = v * label.shape[0] // size[1], u * label.shape[1] // size[0]
         color = scene.labels.colors_rgb[label[rows, columns]].astype(float)
         if view.image is not None:
@@ -654,6 +681,60 @@ def _scale_bar(axis: Any) -> None:
     )
 
 
+class _Request(NamedTuple):
+    """What a figure is drawn from. views: those that were asked for; each: a figure of each of
+    them, not of the first alone."""
+
+    scene: Scene
+    folder: str
+    views: List[View]
+    each: bool
+
+    def path(self, name: str) -> str:
+        return os.path.join(self.folder, name)
+
+    def pick(self, ready: List[View]) -> List[View]:
+        return ready if self.each else ready[:1]
+
+
+def _make_2(request: _Request) -> List[str]:
+    drawn = []
+    for view in request.pick([view for view in request.views if view.has_uncertainty]):
+        drawn.append(request.path("figure2_%s.png" % view.name))
+        draw_uncertainty(drawn[-1], view, request.scene.labels)
+    return drawn
+
+
+def _make_3(request: _Request) -> List[str]:
+    drawn = []
+    for view in request.pick([view for view in request.views if view.has_score_maps]):
+        drawn.append(request.path("figure3_%s.png" % view.name))
+        draw_score_maps(drawn[-1], view, request.scene.labels)
+    return drawn
+
+
+def _make_5(request: _Request) -> List[str]:
+    if not any(view.has_projection for view in request.scene.views):
+        return []
+    draw_projection(request.path("figure5.png"), request.scene)
+    return [request.path("figure5.png")]
+
+
+def _make_6(request: _Request) -> List[str]:
+    draw_top_views(request.path("figure6.png"), request.scene)
+    return [request.path("figure6.png")]
+
+
+# Number of the figure -> what draws it (paths; none if it lacks something), and what it needs.
+_MAKERS: Dict[str, Tuple[Callable[[_Request], List[str]], str]] = {
+    "2": (_make_2, "fuse_bag --all, and --source with the images"),
+    "3": (_make_3, "fuse_bag --all, and the scores (--source)"),
+    "5": (_make_5, "--source with images, camera_info and tf"),
+    "6": (_make_6, "a scan"),
+}
+FIGURES = tuple(_MAKERS)
+
+
 def make(scene: Scene, folder: str, chosen: Tuple[str, ...], camera: Optional[str]) -> List[str]:
     """Draws the figures into a folder; returns their paths. Warns of those that lack something;
     DataError if none can be drawn."""
@@ -662,41 +743,16 @@ def make(scene: Scene, folder: str, chosen: Tuple[str, ...], camera: Optional[st
     if camera is not None and camera not in names:
         raise ConfigError("--camera %s: the rig has %s" % (camera, ", ".join(names) or "none"))
     views = [view for view in scene.views if camera in (None, view.name)]
+    request = _Request(scene, folder, views, camera is not None)
     drawn: List[str] = []
-
-    def lacks(figure: str, what: str) -> None:
-        cli.warn("figure %s is left out: %s" % (figure, what))
-
-    def path(name: str) -> str:
-        drawn.append(os.path.join(folder, name))
-        return drawn[-1]
-
-    if "2" in chosen:
-        ready = [
-            v
-            for v in views
-            if v.image is not None
-            and v.superpixels is not None
-            and v.share is not None
-            and v.labels() is not None
-        ]
-        for view in ready[:1] if camera is None else ready:
-            draw_uncertainty(path("figure2_%s.png" % view.name), view, scene.labels)
-        if not ready:
-            lacks("2", "it needs fuse_bag --all, and --source with the images")
-    if "3" in chosen:
-        ready = [v for v in views if v.scores is not None and v.probabilities is not None]
-        for view in ready[:1] if camera is None else ready:
-            draw_score_maps(path("figure3_%s.png" % view.name), view, scene.labels)
-        if not ready:
-            lacks("3", "it needs fuse_bag --all, and the scores (--source)")
-    if "5" in chosen:
-        if any(v.image is not None and v.to_camera is not None for v in scene.views):
-            draw_projection(path("figure5.png"), scene)
-        else:
-            lacks("5", "it needs --source with images, camera_info and tf")
-    if "6" in chosen:
-        draw_top_views(path("figure6.png"), scene)
+    for number in FIGURES:
+        if number not in chosen:
+            continue
+        draw, needs = _MAKERS[number]
+        paths = draw(request)
+        if not paths:
+            cli.warn("figure %s is left out: it needs %s" % (number, needs))
+        drawn += paths
     if not drawn:
         raise DataError("no figure could be drawn")
     return drawn
