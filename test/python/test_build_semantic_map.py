@@ -146,6 +146,13 @@ def test_a_dask_cluster_gives_the_same_bytes(room, built, tmp_path):
             os.environ["PYTHONPATH"] = old
 
 
+def test_a_scheduler_that_is_not_there_is_said(monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(build, "DASK_PATIENCE_S", 1.0)
+    with pytest.raises(DataError, match="no Dask scheduler at tcp://127.0.0.1:1"):
+        next(build._dask_results([], b"", "tcp://127.0.0.1:1"))
+
+
 def add_part(accumulator, result):
     accumulator.add(
         np.frombuffer(result.records, dtype=accumulator.voxels.dtype),

@@ -31,7 +31,7 @@ from semantic_lidar_fusion.maps.semantic_map import COUNTS, VoxelMap
 
 SCANS_PER_PART = 20
 # What does not answer for so long is lost (s).
-DASK_PATIENCE_S = 8.0
+DASK_PATIENCE_S = 5.0
 
 
 class Part(NamedTuple):

@@ -51,8 +51,8 @@ def ground_surface(lowest_m: np.ndarray, cell_m: float) -> np.ndarray:
 
 
 class Ground:
-    """The ground of a map of many tiles. Only the lowest heights of all tiles are kept (256 KB each),
-    and the surface of the last ones that were asked for."""
+    """The ground of a map of many tiles. Only the lowest heights of all tiles are kept (6 bytes for
+    each cell that has one), and the surface of the last ones that were asked for."""
 
     _KEPT = 8  # tiles
 
@@ -62,15 +62,17 @@ class Ground:
         voxel_size_m: float,
     ):
         self._cell_m = voxel_size_m
-        self._lowest: Dict[Tuple[int, int], np.ndarray] = {}
+        self._lowest: Dict[Tuple[int, int], Tuple[np.ndarray, np.ndarray]] = {}
         self._known: "collections.OrderedDict[Tuple[int, int], np.ndarray]" = (
             collections.OrderedDict()
         )
         for tile, records, _ in tiles():
             if len(records):
-                self._lowest[tile] = lowest_heights(
+                lowest = lowest_heights(
                     records, voxel_size_m, tile[0] * TILE, tile[1] * TILE, (TILE, TILE)
-                )
+                ).reshape(-1)
+                cells = np.flatnonzero(~np.isnan(lowest)).astype(np.uint16)
+                self._lowest[tile] = (cells, lowest[cells])
 
     def of(self, tile: Tuple[int, int]) -> np.ndarray:
         """(256, 256) float32: the ground of a tile (m), NaN = unknown."""
@@ -81,9 +83,8 @@ class Ground:
                 for column in range(3):
                     part = self._lowest.get((tile[0] + column - 1, tile[1] + row - 1))
                     if part is not None:
-                        around[
-                            row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE
-                        ] = part
+                        y, x = np.divmod(part[0].astype(np.int64), TILE)
+                        around[row * TILE + y, column * TILE + x] = part[1]
             low, high = TILE - margin, 2 * TILE + margin
             surface = ground_surface(around[low:high, low:high], self._cell_m)
             self._known[tile] = surface[margin:-margin, margin:-margin]
