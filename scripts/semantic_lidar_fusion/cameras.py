@@ -27,7 +27,7 @@ class Camera:
         max_theta_deg: float = 0.0,
     ):
         try:
-            from semantic_lidar_fusion import _cameras
+            from semantic_lidar_fusion import _cameras  # type: ignore[attr-defined]
         except ImportError as error:
             raise DataError(
                 "camera models need the module _cameras: build with pybind11 and Python.h (%s)"
