@@ -5,76 +5,47 @@
 #include <ros/master.h>
 #include <std_msgs/String.h>
 
-#include <algorithm>
+#include <exception>
 #include <string>
 #include <vector>
 
 #include "base/parameters.h"
 #include "edge/version.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
 namespace semantic_lidar_fusion {
 namespace {
 
 const ros::WallDuration kTickPeriod(0.005);
 const ros::WallDuration kDiagnosticsPeriod(1.0);
-constexpr std::chrono::seconds kReportPeriod{30};
-/// Silence after which the watchdog speaks.
-constexpr std::chrono::seconds kSilence{5};
-constexpr auto kEver = std::chrono::duration<double>::max();
-/// A clock that stands still for longer is taken for the end of a bag.
-constexpr StampNs kClockStall = 3 * kNsPerSecond;
 
-const char* const kSilentClock = "use_sim_time is true but /clock is silent; play with --clock";
-
+/// Simulated time that has never run.
 bool clockIsSilent() { return ros::Time::isSimTime() && ros::Time::now().isZero(); }
 
-/// Number of single-letter edits that make b of a (Levenshtein).
-std::size_t editDistance(const std::string& a, const std::string& b) {
-  std::vector<std::size_t> row(b.size() + 1);
-  for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
-  for (std::size_t i = 1; i <= a.size(); ++i) {
-    std::size_t diagonal = row[0];
-    row[0] = i;
-    for (std::size_t j = 1; j <= b.size(); ++j) {
-      const std::size_t above = row[j];
-      row[j] = std::min({row[j] + 1, row[j - 1] + 1, diagonal + (a[i - 1] == b[j - 1] ? 0 : 1)});
-      diagonal = above;
-    }
-  }
-  return row.back();
-}
-
-std::string lastName(const std::string& topic) { return topic.substr(topic.rfind('/') + 1); }
-
-bool isAdvertised(const std::string& topic, const ros::master::V_TopicInfo& topics) {
-  return std::any_of(topics.begin(), topics.end(),
-                     [&](const auto& info) { return info.name == topic; });
-}
-
-/// "no message on /a/b, which is advertised", or with the advertised topics that look like it.
-std::string describeSilentTopic(const std::string& topic, const ros::master::V_TopicInfo& topics) {
-  if (isAdvertised(topic, topics)) return "no message on " + topic + ", which is advertised";
-  std::string similar;
-  for (const auto& info : topics) {
-    if (lastName(info.name) == lastName(topic) ||
-        editDistance(info.name, topic) <= std::max<std::size_t>(2, topic.size() / 5)) {
-      similar += (similar.empty() ? "" : ", ") + info.name;
-    }
-  }
-  return "no message on " + topic + ", which nobody advertises" +
-         (similar.empty() ? "" : "; advertised similar: " + similar);
+std::vector<std::string> advertisedTopics() {
+  ros::master::V_TopicInfo topics;
+  ros::master::getTopics(topics);
+  std::vector<std::string> names;
+  for (const ros::master::TopicInfo& topic : topics) names.push_back(topic.name);
+  return names;
 }
 
 }  // namespace
+
+FusionNodelet::FusionNodelet()
+    : connections_(
+          health_,
+          [this](const std::string& where, const std::function<void()>& work) {
+            guard(where, work);
+          },
+          [this](const std::string& topic) { reportOverflow(topic); }) {}
 
 FusionNodelet::~FusionNodelet() { stop(); }
 
 void FusionNodelet::stop() {
   diagnostics_timer_.stop();
   tick_timer_.stop();
-  gate_->close();
+  connections_.close();
 }
 
 void FusionNodelet::takeQueues() {
@@ -98,15 +69,6 @@ void FusionNodelet::onInit() {
     }
     rig_ = loadRigFromParameters(getPrivateNodeHandle());
     publishConfiguration();
-    diagnostics_ = std::make_unique<diagnostic_updater::Updater>(getNodeHandle(),
-                                                                 getPrivateNodeHandle(), getName());
-    diagnostics_->setHardwareID(rig_.name.empty() ? "none" : rig_.name);
-    diagnostics_->add("fusion", [this](diagnostic_updater::DiagnosticStatusWrapper& status) {
-      health_.fill(status);
-      if (clockIsSilent()) {
-        status.mergeSummary(diagnostic_msgs::DiagnosticStatus::STALE, kSilentClock);
-      }
-    });
     {
       // Listeners may connect while publishers are still being set up.
       std::lock_guard<std::mutex> lock(connect_mutex_);
@@ -114,11 +76,7 @@ void FusionNodelet::onInit() {
       initialized_ = true;
       updateSubscriptions();
     }
-    // Wall time: ROS timers stand still while /clock is silent, which is one thing to report.
-    diagnostics_timer_ = getMTNodeHandle().createWallTimer(
-        kDiagnosticsPeriod, [this, gate = gate_](const ros::WallTimerEvent&) {
-          gate->pass([this] { guard("watchdog", [this] { watch(); }); });
-        });
+    startDiagnostics();
   } catch (const ConfigError& problem) {
     NODELET_FATAL_STREAM(problem.what());
   } catch (const std::exception& problem) {
@@ -133,30 +91,35 @@ void FusionNodelet::publishConfiguration() {
 }
 
 void FusionNodelet::startTicking() {
-  tick_timer_ = getNodeHandle().createWallTimer(
-      kTickPeriod, [this, gate = gate_](const ros::WallTimerEvent&) {
-        gate->pass([this] { guard("tick", [this] { tick(now()); }); });
-      });
+  const auto run = connections_.runner("tick", [this] { tick(now()); });
+  tick_timer_ =
+      getNodeHandle().createWallTimer(kTickPeriod, [run](const ros::WallTimerEvent&) { run(); });
 }
 
-StampNs FusionNodelet::now() const {
-  if (!ros::Time::isSimTime()) return static_cast<StampNs>(ros::SteadyTime::now().toNSec());
-  const auto [elapsed_ns, stood_still_ns] = simulatedClock();
-  return elapsed_ns + std::max<StampNs>(0, stood_still_ns - kClockStall);
+void FusionNodelet::startDiagnostics() {
+  diagnostics_ = std::make_unique<diagnostic_updater::Updater>(getNodeHandle(),
+                                                               getPrivateNodeHandle(), getName());
+  diagnostics_->setHardwareID(rig_.name.empty() ? "none" : rig_.name);
+  diagnostics_->add("fusion", [this](diagnostic_updater::DiagnosticStatusWrapper& status) {
+    health_.fill(status);
+    if (clockIsSilent()) {
+      status.mergeSummary(diagnostic_msgs::DiagnosticStatus::STALE, kSilentClock);
+    }
+  });
+  // Wall time: ROS timers stand still while /clock is silent, which is one thing to report.
+  const auto run = connections_.runner("watchdog", [this] { watch(); });
+  diagnostics_timer_ = getMTNodeHandle().createWallTimer(
+      kDiagnosticsPeriod, [run](const ros::WallTimerEvent&) { run(); });
 }
 
-std::pair<StampNs, StampNs> FusionNodelet::simulatedClock() const {
-  const auto steady_ns = static_cast<StampNs>(ros::SteadyTime::now().toNSec());
-  const auto clock_ns = static_cast<StampNs>(ros::Time::now().toNSec());
-  std::lock_guard<std::mutex> lock(clock_mutex_);
-  if (clock_ns != clock_ns_) {
-    // A jump is no time that passes: no deadline is due because of it.
-    const StampNs step_ns = clock_ns - clock_ns_;
-    if (step_ns > 0 && step_ns < EpochMonitor::kForwardNs) elapsed_ns_ += step_ns;
-    clock_ns_ = clock_ns;
-    clock_changed_ns_ = steady_ns;
-  }
-  return {elapsed_ns_, steady_ns - clock_changed_ns_};
+void FusionNodelet::watch() {
+  diagnostics_->force_update();
+  SilenceWatchdog::Surroundings surroundings;
+  surroundings.clock_is_silent = clockIsSilent();
+  surroundings.clock_is_stalled = clock_.isStalled();
+  surroundings.explain_silence = [this] { return explainSilence(); };
+  surroundings.advertised = advertisedTopics;
+  if (const auto report = watchdog_.look(health_, surroundings)) warn(report->key, report->text);
 }
 
 void FusionNodelet::guard(const std::string& where, const std::function<void()>& work) {
@@ -178,55 +141,13 @@ void FusionNodelet::reportOverflow(const std::string& topic) {
                                 "are dropped");
 }
 
-bool FusionNodelet::mayReport(const std::string& key) {
-  std::lock_guard<std::mutex> lock(report_mutex_);
-  const auto now = Health::Clock::now();
-  const auto [entry, first] = reported_.emplace(key, now);
-  if (!first && now - entry->second < kReportPeriod) return false;
-  entry->second = now;
-  return true;
-}
-
 void FusionNodelet::warn(const std::string& key, const std::string& text) {
-  if (mayReport(key)) NODELET_WARN_STREAM(text);
+  if (reports_.mayReport(key)) NODELET_WARN_STREAM(text);
 }
 
 void FusionNodelet::error(const std::string& key, const std::string& text) {
   health_.error(text);
-  if (mayReport(key)) NODELET_ERROR_STREAM(text);
-}
-
-void FusionNodelet::watch() {
-  diagnostics_->force_update();
-  const bool is_halted = ros::Time::isSimTime() && simulatedClock().second > kClockStall;
-  const auto now = Health::Clock::now();
-  if (now - started_ < kSilence || now - watched_ < kSilence) return;
-  watched_ = now;
-  const bool is_silent = !health_.publishedWithin(kSilence);
-  if (is_silent && clockIsSilent()) {
-    warn("clock", kSilentClock);
-    return;
-  }
-  const std::string idle = explainSilence();
-  if (is_silent && !is_halted && !idle.empty()) {
-    warn("idle", "nothing published for 5 s: " + idle);
-    return;
-  }
-  // A bag that is paused or has ended is no news; what it never held is.
-  const std::vector<std::string> silent =
-      health_.silentInputs(is_halted ? kEver : std::chrono::duration<double>(kSilence));
-  if (silent.empty()) return;
-  ros::master::V_TopicInfo topics;
-  ros::master::getTopics(topics);
-  std::string reasons;
-  for (const auto& topic : silent) {
-    // While something is published, only what nobody advertises is worth a line: a camera that is
-    // merely late is counted where it is missed.
-    if ((!is_silent || is_halted) && isAdvertised(topic, topics)) continue;
-    reasons += (reasons.empty() ? "" : "; ") + describeSilentTopic(topic, topics);
-  }
-  if (reasons.empty()) return;
-  warn("silence " + reasons, std::string(is_silent ? "nothing published for 5 s: " : "") + reasons);
+  if (reports_.mayReport(key)) NODELET_ERROR_STREAM(text);
 }
 
 }  // namespace semantic_lidar_fusion
