@@ -12,6 +12,7 @@
 #include <set>
 #include <sstream>
 
+#include "semantic_lidar_fusion/common/edit_distance.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {
@@ -223,29 +224,25 @@ std::string describeValue(const YAML::Node& node) {
   return text;
 }
 
+namespace {
+
+std::string lower(std::string text) {
+  for (char& c : text) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
+  return text;
+}
+
+}  // namespace
+
 std::string nearestName(const std::string& word, const std::vector<std::string>& names) {
   constexpr std::size_t kLongest = 64;
   if (word.size() > kLongest) return {};
   std::string nearest;
   std::size_t least = std::max<std::size_t>(2, word.size() / 3) + 1;
   for (const std::string& name : names) {
-    // Levenshtein's distance, one row of the table at a time; case does not count.
-    std::vector<std::size_t> row(name.size() + 1);
-    for (std::size_t j = 0; j < row.size(); ++j) row[j] = j;
-    for (std::size_t i = 1; i <= word.size(); ++i) {
-      std::size_t diagonal = row[0];
-      row[0] = i;
-      for (std::size_t j = 1; j < row.size(); ++j) {
-        const bool equal = std::tolower(static_cast<unsigned char>(word[i - 1])) ==
-                           std::tolower(static_cast<unsigned char>(name[j - 1]));
-        const std::size_t replaced = diagonal + (equal ? 0 : 1);
-        diagonal = row[j];
-        row[j] = std::min({replaced, row[j] + 1, row[j - 1] + 1});
-      }
-    }
+    const std::size_t distance = editDistance(lower(word), lower(name));
     // A word that shares no letter with the name is not a misspelling of it.
-    if (row.back() < least && row.back() < std::max(word.size(), name.size())) {
-      least = row.back();
+    if (distance < least && distance < std::max(word.size(), name.size())) {
+      least = distance;
       nearest = name;
     }
   }

@@ -199,7 +199,7 @@ BREACHES = {
     "nodelets/edge/l.cpp": '#include "tools/common/bag_output.h"\n',
     "nodelets/edge/m.cpp": '#include "semantic_lidar_fusion/fusion/scan_pipeline.h"\n',
     "nodelets/base/o.cpp": '#include "tools/fuse_bag/bag_fusion.h"\n',
-    "nodelets/p_nodelet.cpp": '#include "tools/common/drop_log.h"\n',
+    "nodelets/p_nodelet.cpp": '#include "tools/fuse_bag/drop_log.h"\n',
     "nodelets/tools/common/q.h": '#include "tools/fuse_bag/bag_fusion.h"\n',
     "nodelets/tools/fuse_bag/r.h": '#include "tools/simulate_drive/world.h"\n',
     "nodelets/tools/attic/s.h": "#include <vector>\n",

@@ -127,6 +127,7 @@ class Drive:
     with_static_tf: bool = True
     camera_info_for: Optional[List[str]] = None  # names; all if None
     images_for: Optional[List[str]] = None
+    images_until_s: Optional[float] = None  # no image later than this
     empty_scans: Tuple[int, ...] = ()
     compression: str = "none"
     seed: int = 1
@@ -208,7 +209,7 @@ class Drive:
         return self.class_of(hits).reshape(camera.height, camera.width).astype(np.uint8)
 
     def image_stamps_ns(self, camera: Camera) -> List[int]:
-        last = int(self.end_s * 1e9)
+        last = int((self.end_s if self.images_until_s is None else self.images_until_s) * 1e9)
         return [START_NS + t for t in range(camera.phase_ns, last, camera.period_ns)]
 
     # -- lidar

@@ -657,7 +657,7 @@ def assert_fails(result, *words, code=1):
 
 
 def leftovers(folder):
-    return [name for name in os.listdir(str(folder)) if ".tmp" in name or name == "out.bag"]
+    return [name for name in os.listdir(str(folder)) if name.startswith("out.bag")]
 
 
 @pytest.mark.parametrize(
@@ -826,16 +826,65 @@ def test_disk_full_at_the_very_end(room, fused, tmp_path):
         assert not leftovers(tmp_path)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupt_leaves_nothing(room, tmp_path, number):
-    arguments = [room.bag, tmp_path / "out.bag", "--rig", room.rig, "--all"]
+def started(room, folder):
+    """A run that has begun to write folder/out.bag."""
+    arguments = [room.bag, folder / "out.bag", "--rig", room.rig, "--all"]
+    before = set(os.listdir(str(folder)))
     process = subprocess.Popen(
         [program()] + [str(a) for a in arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     deadline = time.time() + 60
-    while not (tmp_path / "out.bag.tmp").exists():
+    while set(os.listdir(str(folder))) <= before:
         assert process.poll() is None and time.time() < deadline
         time.sleep(0.001)
+    return process
+
+
+def test_two_runs_with_one_output_do_not_meet(room, fused, tmp_path):
+    runs = [started(room, tmp_path), started(room, tmp_path)]
+    for process in runs:
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors
+        assert b"killed" not in errors
+    assert leftovers(tmp_path) == ["out.bag"]
+    with rosbag.Bag(str(tmp_path / "out.bag")) as bag:
+        clouds = [m for _, m, _ in bag.read_messages("/points_semantic")]
+    assert clouds == fused.of("/points_semantic")
+
+
+def test_what_a_killed_run_leaves_is_removed_by_the_next(room, tmp_path):
+    killed = started(room, tmp_path)
+    killed.kill()
+    killed.communicate(timeout=60)
+    (left,) = leftovers(tmp_path)
+    assert left.startswith("out.bag.unfinished-%d-" % killed.pid)
+    writing = started(room, tmp_path)
+    _, errors = writing.communicate(timeout=120)
+    assert writing.returncode == 0 and left.encode() in errors, errors
+    assert leftovers(tmp_path) == ["out.bag"]
+
+
+def test_files_of_similar_names_are_left_alone(room, tmp_path):
+    mine = [
+        "out.bag.tmp",
+        "out.bag.unfinished",
+        "out.bag.unfinished-1-2.bag",
+        "out.bag.unfinished-x-1",
+    ]
+    for name in mine:
+        (tmp_path / name).write_text("my notes")
+    goal = tmp_path / "notes"
+    goal.write_text("more notes")
+    (tmp_path / "out.bag.unfinished-1-2").symlink_to(goal)
+    assert run(room.bag, tmp_path / "out.bag", "--rig", room.rig).returncode == 0
+    assert goal.read_text() == "more notes"
+    assert all((tmp_path / name).read_text() == "my notes" for name in mine)
+    assert (tmp_path / "out.bag.unfinished-1-2").is_symlink()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_leaves_nothing(room, tmp_path, number):
+    process = started(room, tmp_path)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 128 + number, errors

@@ -28,6 +28,23 @@ class ReplayEqualsOffline(live.ReplayCase):
     def test_points(self):
         self.replay(Drive(scans=6, cameras=live.cameras(), points_per_scan=3200))
 
+    def test_images_that_end_before_the_middle_of_the_last_scan(self):
+        """Live a timeout decides its t_ref, offline the end of the bag: by one rule."""
+        drive = Drive(
+            scans=4, cameras=live.cameras(), points_per_scan=1600, images_until_s=0.1 + 0.3 + 0.045
+        )
+        last_middle = (drive.scan_start_ns(3) + drive.scan_start_ns(4)) // 2
+        images = drive.image_stamps_ns(drive.cameras[0])
+        self.assertLess(images[-1], last_middle)
+        overrides = ["cameras.%s.timeout=3" % name for name in ("front", "left")]
+        overrides += ["odometry.timeout=20", "segmentation.mode=free_running"]
+        with live.folder() as path:
+            made = live.Made(path, drive)
+            expected = made.fused(*overrides)
+            self.assertEqual(len(expected), drive.scans)
+            self.assertIn(images[-1], expected)  # t_ref of the last scan
+            self.assert_replay_gives(expected, made.bag, made.rig, overrides, made.topics())
+
     def test_packets_without_velodyne_msgs(self):
         self.replay(Drive(scans=4, cameras=live.cameras(), lidar="packets"))
 

@@ -15,7 +15,7 @@
 #include "semantic_lidar_fusion/camera/camera_model.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "tools/common/bag_input.h"
-#include "tools/common/drop_log.h"
+#include "tools/fuse_bag/drop_log.h"
 
 namespace semantic_lidar_fusion {
 

@@ -2,20 +2,15 @@
 #include "tools/simulate_drive/drive_simulation.h"
 
 #include <nav_msgs/Odometry.h>
-#include <rosbag/bag.h>
 #include <sensor_msgs/CameraInfo.h>
 #include <sensor_msgs/CompressedImage.h>
 #include <sensor_msgs/Image.h>
 #include <sensor_msgs/PointCloud2.h>
 #include <std_msgs/String.h>
-#include <sys/stat.h>
 #include <tf2_msgs/TFMessage.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <cmath>
-#include <cstdio>
-#include <cstring>
 #include <iterator>
 #include <map>
 #include <memory>
@@ -56,75 +51,6 @@ constexpr int kReferenceCamera = 0;
 constexpr StampNs kScoreDelayNs = 40000000;
 constexpr int kScoreStride = 8;  // full-resolution pixels a cell
 constexpr int kJpegQuality = 92;
-
-/// A bag that takes its name when it is whole.
-class Bag {
- public:
-  Bag(const std::string& path, bool force) : path_(path), temporary_(path + ".tmp") {
-    struct stat status {};
-    if (::stat(path.c_str(), &status) == 0) {
-      if (!S_ISREG(status.st_mode)) throw Error(path + ": exists and is not a file");
-      if (!force) throw Error(path + ": exists; give --force to replace it");
-    }
-    try {
-      bag_->open(temporary_, rosbag::bagmode::Write);
-      bag_->setCompression(rosbag::compression::LZ4);
-    } catch (const rosbag::BagException& e) {
-      throw Error(path + ": cannot be written: " + e.what());
-    }
-  }
-  ~Bag() {
-    if (committed_) return;
-    try {
-      close();
-    } catch (const Error&) {
-      // Of no interest: the file goes.
-    }
-    ::unlink(temporary_.c_str());
-  }
-  Bag(const Bag&) = delete;
-  Bag& operator=(const Bag&) = delete;
-
-  template <typename Message>
-  void write(const std::string& topic, StampNs record_ns, const Message& message,
-             bool latched = false) {
-    auto header = boost::make_shared<ros::M_string>();
-    (*header)["topic"] = topic;
-    (*header)["type"] = ros::message_traits::datatype(message);
-    (*header)["md5sum"] = ros::message_traits::md5sum(message);
-    (*header)["message_definition"] = ros::message_traits::definition(message);
-    (*header)["callerid"] = "/simulate_drive";
-    (*header)["latching"] = latched ? "1" : "0";
-    try {
-      bag_->write(topic, rosTime(record_ns), message, header);
-    } catch (const rosbag::BagException& e) {
-      throw Error(path_ + ": cannot be written: " + e.what());
-    }
-  }
-
-  void commit() {
-    close();
-    if (std::rename(temporary_.c_str(), path_.c_str()) != 0) {
-      throw Error(path_ + ": cannot be written: " + std::strerror(errno));
-    }
-    committed_ = true;
-  }
-
- private:
-  /// Closes the bag once.
-  void close() {
-    if (!bag_) return;
-    try {
-      closeBag(std::move(bag_));
-    } catch (const rosbag::BagException& e) {
-      throw Error(path_ + ": cannot be written: " + e.what());
-    }
-  }
-
-  std::string path_, temporary_;
-  std::unique_ptr<rosbag::Bag> bag_ = std::make_unique<rosbag::Bag>();
-  bool committed_ = false;
-};
 
 std_msgs::Header headerOf(StampNs stamp, const std::string& frame) {
   std_msgs::Header header;
@@ -195,7 +121,9 @@ class Simulation {
   }
 
   void run() {
-    Bag bag(options_.output, options_.force);
+    BagOutput bag(options_.output, "simulate_drive",
+                  options_.force ? Existing::kReplace : Existing::kRefuse);
+    bag.compress();
     StreetOptions street;
     street.seed = options_.seed;
     street.moving = options_.moving;
@@ -306,7 +234,7 @@ class Simulation {
     }
   }
 
-  void writeStatic(Bag* bag) {
+  void writeStatic(BagOutput* bag) {
     const StampNs stamp = kStartNs - toNs(kOdometryMarginS);
     tf2_msgs::TFMessage transforms;
     transforms.transforms.push_back(transformMessage(lidarPose(), stamp, "base_link", kLidarFrame));
@@ -314,11 +242,11 @@ class Simulation {
       transforms.transforms.push_back(
           transformMessage(mounted.T_base_said, stamp, "base_link", mounted.said_info.frame_id));
     }
-    bag->write("/tf_static", stamp, transforms, true);
+    bag->writeLatched("/tf_static", stamp, transforms);
     if (told()) {
       std_msgs::String message;
       message.data = errorsText();
-      bag->write("/truth/errors", stamp, message, true);
+      bag->writeLatched("/truth/errors", stamp, message);
     }
   }
 
@@ -369,7 +297,7 @@ class Simulation {
   }
 
   /// Odometry, camera_info and scans, as they come in time.
-  void writeUntil(StampNs until, Bag* bag) {
+  void writeUntil(StampNs until, BagOutput* bag) {
     const int last =
         static_cast<int>(std::floor((options_.duration_s + kOdometryMarginS) * kOdometryHz));
     const int first = -static_cast<int>(kOdometryMarginS * kOdometryHz);
@@ -395,7 +323,7 @@ class Simulation {
     }
   }
 
-  void writeCameraInfos(StampNs stamp, Bag* bag) {
+  void writeCameraInfos(StampNs stamp, BagOutput* bag) {
     for (const MountedCamera& mounted : cameras_) {
       const CameraInfo& info = mounted.said_info;
       sensor_msgs::CameraInfo message;
@@ -407,11 +335,11 @@ class Simulation {
       std::copy(info.k.begin(), info.k.end(), message.K.begin());
       std::copy(info.r.begin(), info.r.end(), message.R.begin());
       std::copy(info.p.begin(), info.p.end(), message.P.begin());
-      bag->write("/gmsl/" + mounted.name + "/camera_info", stamp, message, true);
+      bag->writeLatched("/gmsl/" + mounted.name + "/camera_info", stamp, message);
     }
   }
 
-  void writeScan(const Scan& scan, Bag* bag) {
+  void writeScan(const Scan& scan, BagOutput* bag) {
     VelodyneScan message;
     message.header = headerOf(scan.simulated.packets.back().stamp, kLidarFrame);
     for (const Packet& packet : scan.simulated.packets) {
@@ -480,7 +408,7 @@ class Simulation {
     return message;
   }
 
-  void renderImages(StampNs stamp, Bag* bag) {
+  void renderImages(StampNs stamp, BagOutput* bag) {
     const auto found = used_.find(stamp);
     for (std::size_t c = 0; c < cameras_.size(); ++c) {
       const Camera& camera = cameras_[c].camera;
@@ -510,7 +438,7 @@ class Simulation {
   }
 
   void writeImage(const Picture& picture, const std::string& ns, StampNs stamp,
-                  const std_msgs::Header& header, Bag* bag) const {
+                  const std_msgs::Header& header, BagOutput* bag) const {
     if (options_.raw_images) {
       bag->write(ns + "/image_color", stamp, *imageMessage(picture.image, header));
       return;

@@ -1,0 +1,62 @@
+// SPDX-License-Identifier: MIT
+#include "tools/fuse_bag/run_report.h"
+
+#include <algorithm>
+#include <cstdio>
+
+namespace semantic_lidar_fusion {
+namespace {
+
+std::string percent(std::uint64_t part, std::uint64_t whole) {
+  char text[16];
+  std::snprintf(text, sizeof(text), "%.1f %%",
+                whole ? 100.0 * static_cast<double>(part) / static_cast<double>(whole) : 0.0);
+  return text;
+}
+
+std::string count(std::uint64_t n, const std::string& thing) {
+  return std::to_string(n) + " " + thing + (n == 1 ? "" : "s");
+}
+
+}  // namespace
+
+void RunReport::countScan(const Cloud& semantic) {
+  ++scans_;
+  points_ += semantic.size();
+  const auto by_status = countByStatus(semantic);
+  for (std::size_t s = 0; s < by_status.size(); ++s) by_status_[s] += by_status[s];
+}
+
+std::string RunReport::text(const Input& input, const DropLog& drops) const {
+  std::string text = input.output + ": " + count(scans_, "scan") + " of " +
+                     std::to_string(input.scans) + ", " + count(points_, "point") + " (";
+  for (std::size_t s = 0; s < by_status_.size(); ++s) {
+    text +=
+        (s ? ", " : "") + std::string(kPointStatusNames[s]) + " " + percent(by_status_[s], points_);
+  }
+  text += ")\n";
+  for (std::size_t c = 0; c < cameras_.size(); ++c) {
+    const auto scans = [&](Contribution contribution) {
+      return cameras_[c][static_cast<std::size_t>(contribution)];
+    };
+    text += "  camera " + input.cameras[c].name + ": in " +
+            count(scans(Contribution::kUsed), "scan") + "; no image in time in " +
+            std::to_string(scans(Contribution::kNone)) + ", image not usable in " +
+            std::to_string(scans(Contribution::kLost)) + "; " +
+            count(input.cameras[c].images, "image") + " and " +
+            std::to_string(input.cameras[c].scores) + " of scores in the bag\n";
+  }
+  if (!input.time_decision.empty()) text += "  " + input.time_decision + "\n";
+  if (drops.counts().empty()) text += "  nothing was dropped\n";
+  for (const auto& drop : drops.counts()) {
+    text += "  counted: " + drop.first + ": " + std::to_string(drop.second) + "\n";
+  }
+  const double seconds =
+      std::chrono::duration<double>(std::chrono::steady_clock::now() - started_).count();
+  char time[80];
+  std::snprintf(time, sizeof(time), "  %.1f s (%.1f scans/s)\n", seconds,
+                static_cast<double>(input.scans) / std::max(seconds, 1e-9));
+  return text + time;
+}
+
+}  // namespace semantic_lidar_fusion
