@@ -204,6 +204,8 @@ def _lenses(camera: CameraSample) -> List[Tuple[str, str, alignment.Projection]]
 
     info = camera.info
     assert info is not None
+    if camera.has_lens_file:
+        return []
     image = next(iter(camera.images.values()), None)
     result: List[Tuple[str, str, alignment.Projection]] = []
 

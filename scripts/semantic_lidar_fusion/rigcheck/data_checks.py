@@ -133,7 +133,7 @@ def _one_info(camera: CameraSample) -> List[Finding]:
     k = np.array(info.P if camera.config.get("rectified") else info.K, dtype=float)
     fx, cx, cy = k[0], k[2], (k[6] if camera.config.get("rectified") else k[5])
     model = camera.model()
-    if fx <= 0 or model is None:
+    if (fx <= 0 and not camera.has_lens_file) or model is None:
         figure = "fx is %g%s" % (fx, "; " + camera.problems[-1] if camera.problems else "")
         return [
             Finding(
@@ -151,6 +151,9 @@ def _one_info(camera: CameraSample) -> List[Finding]:
         cause = "the calibration belongs to another resolution"
         cure = "publish the camera_info of this resolution (scale K, or set binning and ROI)"
         return [Finding(camera.name, "camera_info", Verdict.WRONG, figure, cause, cure)]
+    if camera.has_lens_file:
+        figure = "%dx%d, lens from a file" % (width, height)
+        return [Finding(camera.name, "camera_info", Verdict.OK, figure)]
     roi = info.roi.x_offset, info.roi.y_offset
     cx, cy = (cx - roi[0]) / max(1, info.binning_x), (cy - roi[1]) / max(1, info.binning_y)
     away = max(abs(cx - width / 2) / width, abs(cy - height / 2) / height)

@@ -98,6 +98,11 @@ class CameraSample:
         return str(self.config["name"])
 
     @property
+    def has_lens_file(self) -> bool:
+        """Whether the rig names a file that calibrates the lens in place of camera_info."""
+        return bool((self.config.get("lens") or {}).get("file"))
+
+    @property
     def offset_ns(self) -> int:
         return int(round(float(self.config.get("time_offset", 0.0)) * 1e9))
 
@@ -107,7 +112,10 @@ class CameraSample:
             return None
         try:
             return Camera(
-                self.info, bool(self.config.get("rectified", False)), self.config.get("lens")
+                self.info,
+                bool(self.config.get("rectified", False)),
+                self.config.get("lens"),
+                float(self.config.get("max_theta_deg", 0.0)),
             )
         except DataError as error:
             if str(error) not in self.problems:
