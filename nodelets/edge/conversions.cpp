@@ -68,6 +68,23 @@ int pixelType(const std::string& encoding) {
   throw DataError("image encoding '" + encoding + "' is not known");
 }
 
+/// A mosaic as colours: a compressed image's format begins with the encoding of its pixels
+/// ("bayer_rggb8; jpeg compressed "), as image_transport writes it.
+cv::Mat demosaiced(const cv::Mat& image, const std::string& format) {
+  const std::string encoding = format.substr(0, format.find_first_of("; "));
+  if (!enc::isBayer(encoding) || image.channels() != 1) return image;
+  try {
+    const int depth = enc::bitDepth(encoding);
+    if (depth != (image.depth() == CV_16U ? 16 : 8)) {
+      throw DataError("holds " + std::to_string(image.depth() == CV_16U ? 16 : 8) + "-bit pixels");
+    }
+    const cv_bridge::CvImage mosaic(std_msgs::Header(), encoding, image);
+    return cv_bridge::toCvCopy(mosaic.toImageMsg(), enc::BGR8)->image;
+  } catch (const std::exception& e) {
+    throw DataError("compressed image of format '" + format + "': " + e.what());
+  }
+}
+
 /// An 8-bit image with 1 or 3 channels from what cv::imdecode may return.
 cv::Mat eightBitImage(cv::Mat image) {
   if (image.depth() == CV_16U) image.convertTo(image, CV_8U, 255.0 / 65535.0);
@@ -301,7 +318,7 @@ cv::Mat decodedImage(const sensor_msgs::CompressedImage& message) {
                     std::to_string(message.data.size()) + " bytes: the JPEG ends too early");
   }
   cv::Mat image = decodedJpeg(message.data);
-  if (!image.empty()) return image;
+  if (!image.empty()) return demosaiced(image, message.format);
   try {
     image = cv::imdecode(message.data, cv::IMREAD_UNCHANGED);
   } catch (const cv::Exception& e) {
@@ -311,7 +328,7 @@ cv::Mat decodedImage(const sensor_msgs::CompressedImage& message) {
     throw DataError("compressed image of format '" + message.format + "', " +
                     std::to_string(message.data.size()) + " bytes, cannot be decoded");
   }
-  return eightBitImage(image);
+  return eightBitImage(demosaiced(image, message.format));
 }
 
 sensor_msgs::ImagePtr imageMessage(const cv::Mat& pixels, const std_msgs::Header& header) {

@@ -71,14 +71,15 @@ RigPlayer::RigPlayer(const Rig& rig, const PlayerOptions& options) : rig_(rig), 
 }
 
 void RigPlayer::load(const PlayerOptions& options) {
-  const BagInput input(options.bag);
-  const auto topic = [&](const std::string& name) {
+  const BagInput input({options.bag});
+  const auto look = [&](const std::string& name, rosbag::View* view) {
     const BagInput::Topic* found = input.find(name);
     if (found == nullptr) throw Error(options.bag + " has no topic " + name);
-    return rosbag::TopicQuery(found->name);
+    input.addTo({found->name}, view);
   };
 
-  rosbag::View scans(input.bag(), topic(rig_.lidar.topic));
+  rosbag::View scans;
+  look(rig_.lidar.topic, &scans);
   for (const rosbag::MessageInstance& message : scans) {
     const auto scan = message.instantiate<VelodyneScan>();
     if (!scan || scan->packets.empty()) throw Error(options.bag + ": a scan has no packets");
@@ -92,7 +93,8 @@ void RigPlayer::load(const PlayerOptions& options) {
   const auto in_round = [&](StampNs offset) { return offset >= 0 && offset < round_; };
   Transform first = Transform::Identity(), end = Transform::Identity();
   StampNs end_error = kScanPeriod;
-  rosbag::View transforms(input.bag(), topic("/tf"));
+  rosbag::View transforms;
+  look("/tf", &transforms);
   for (const rosbag::MessageInstance& message : transforms) {
     const auto readings = message.instantiate<tf2_msgs::TFMessage>();
     for (const auto& reading : readings->transforms) {
@@ -109,7 +111,8 @@ void RigPlayer::load(const PlayerOptions& options) {
   }
   if (odometry_.empty()) throw Error(options.bag + " has no odometry on /tf");
   round_motion_ = end * first.inverse();
-  rosbag::View statics(input.bag(), topic("/tf_static"));
+  rosbag::View statics;
+  look("/tf_static", &statics);
   for (const rosbag::MessageInstance& message : statics) {
     const auto readings = message.instantiate<tf2_msgs::TFMessage>();
     for (const auto& one : readings->transforms) {
@@ -123,9 +126,11 @@ void RigPlayer::load(const PlayerOptions& options) {
     camera.compressed = config.transport == ImageTransport::kCompressed;
     CameraConfig source = config;
     source.transport = ImageTransport::kCompressed;
-    rosbag::View infos(input.bag(), topic(inputTopic(config, config.camera_info)));
+    rosbag::View infos;
+    look(inputTopic(config, config.camera_info), &infos);
     camera.info = *infos.begin()->instantiate<sensor_msgs::CameraInfo>();
-    rosbag::View scores(input.bag(), topic(inputTopic(config, config.scores)));
+    rosbag::View scores;
+    look(inputTopic(config, config.scores), &scores);
     for (const rosbag::MessageInstance& message : scores) {
       const auto image = message.instantiate<sensor_msgs::Image>();
       const StampNs offset = stampNs(image->header.stamp) - bag_start_;
@@ -136,7 +141,8 @@ void RigPlayer::load(const PlayerOptions& options) {
       return std::any_of(camera.scores.begin(), camera.scores.end(),
                          [&](const auto& score) { return score.offset == offset; });
     };
-    rosbag::View images(input.bag(), topic(imageTopic(source)));
+    rosbag::View images;
+    look(imageTopic(source), &images);
     for (const rosbag::MessageInstance& message : images) {
       const auto image = message.instantiate<sensor_msgs::CompressedImage>();
       const StampNs offset = stampNs(image->header.stamp) - bag_start_;

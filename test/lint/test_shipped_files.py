@@ -59,6 +59,7 @@ def test_files_that_launch_files_name_exist():
 
 
 ARGUMENTS = ["rig:=config/kitti.yaml", "bag:=in.bag", "manager:=some_manager", "record:=out.bag"]
+ARGUMENTS += ["nodelet:=ProjectionNodelet", "name:=projection"]
 
 
 def roslaunch(option, path, *arguments):
@@ -158,13 +159,15 @@ def test_subscriptions_do_not_wait_for_nagle():
     places = set()
     for path in files("nodelets/**/*.h") + files("nodelets/**/*.cpp"):
         text = text_of(path)
-        found = len(re.findall(r"\bhandle\.subscribe<|NodeHandle\(\)\.subscribe<", text))
+        found = len(
+            re.findall(r"\b(?:handle|transport)\.subscribe<|NodeHandle\(\)\.subscribe<", text)
+        )
         if found:
             places.add(os.path.basename(path))
             assert "ros::TransportHints().tcpNoDelay()" in text
             hinted = len(re.findall(r"ros::VoidConstPtr\(\),\s*(hints|ros::TransportHints)", text))
             assert hinted == found, path
-    assert places == {"fusion_nodelet.h", "tf_subscription.h"}
+    assert places == {"topic_connections.h", "tf_subscription.h"}
 
 
 def test_rostests_cannot_pass_by_default():

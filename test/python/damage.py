@@ -173,6 +173,8 @@ def _become(words: List[str], folder: str, errors_path: str) -> None:
         os.execv(words[0], words)
     from semantic_lidar_fusion import cli
 
+    # A test runner has streams of its own in their place.
+    sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", 1)
     sys.argv = [os.path.join(SOURCE_DIR, "scripts", words[0])] + words[1:]
     cli.run(_main_of(words[0]))
 

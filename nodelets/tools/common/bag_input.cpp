@@ -35,13 +35,25 @@ std::string bagErrorText(const std::string& path, const std::exception& error) {
   return path + ": " + error.what();
 }
 
-BagInput::BagInput(const std::string& path) : path_(path) {
+BagInput::BagInput(const std::vector<std::string>& paths) {
+  for (const std::string& path : paths) {
+    path_ += (path_.empty() ? "" : ", ") + path;
+    open(path);
+  }
+  if (topics_.empty()) {
+    throw Error(path_ + ": the bag" + (paths.size() == 1 ? " holds" : "s hold") + " no messages");
+  }
+}
+
+void BagInput::open(const std::string& path) {
   checkFile(path);
   try {
-    bag_.open(path, rosbag::bagmode::Read);
-    rosbag::View view(bag_);
+    bags_.emplace_back();
+    bags_.back().open(path, rosbag::bagmode::Read);
+    rosbag::View view(bags_.back());
     for (const rosbag::ConnectionInfo* connection : view.getConnections()) {
       Topic& topic = topics_[bareTopic(connection->topic)];
+      if (!topic.name.empty()) continue;
       topic.name = connection->topic;
       topic.datatype = connection->datatype;
     }
@@ -52,7 +64,15 @@ BagInput::BagInput(const std::string& path) : path_(path) {
   } catch (const std::exception& e) {
     throw Error(bagErrorText(path, e));
   }
-  if (topics_.empty()) throw Error(path + ": the bag holds no messages");
+}
+
+void BagInput::addTo(const std::vector<std::string>& topics, rosbag::View* view) const {
+  std::vector<std::string> names;  // recorders differ in the leading slash
+  for (const std::string& topic : topics) {
+    names.push_back(bareTopic(topic));
+    names.push_back("/" + bareTopic(topic));
+  }
+  for (const rosbag::Bag& bag : bags_) view->addQuery(bag, rosbag::TopicQuery(names));
 }
 
 const BagInput::Topic* BagInput::find(const std::string& topic) const {

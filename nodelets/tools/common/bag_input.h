@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: MIT
-/// A bag that is read: opening it with errors a user understands, and finding topics in it.
+/// The bags of one drive that are read: opening them with errors a user understands, and finding
+/// topics in them.
 #pragma once
 
 #include <rosbag/bag.h>
@@ -7,6 +8,7 @@
 #include <std_msgs/Header.h>
 
 #include <cstdint>
+#include <deque>
 #include <map>
 #include <string>
 #include <vector>
@@ -21,25 +23,29 @@ struct StampedMessage {
 class BagInput {
  public:
   /// Throws Error, one line with path and reason: absent, not a bag, truncated, not indexed.
-  explicit BagInput(const std::string& path);
+  explicit BagInput(const std::vector<std::string>& paths);
 
+  /// The paths, for messages.
   const std::string& path() const { return path_; }
-  const rosbag::Bag& bag() const { return bag_; }
+  /// Adds the messages of these topics of all bags to a view, which merges them by record time.
+  void addTo(const std::vector<std::string>& topics, rosbag::View* view) const;
 
   /// Type and number of messages of a topic; a leading slash does not matter.
   struct Topic {
-    std::string name;  ///< as in the bag
+    std::string name;  ///< as in the first bag that has it
     std::string datatype;
     std::uint64_t messages = 0;
   };
-  /// Null if the bag has no such topic.
+  /// Null if no bag has such a topic.
   const Topic* find(const std::string& topic) const;
   /// "/a, /b (2 more)": the topics of one type; all topics if there is none of it.
   std::string candidates(const std::string& datatype) const;
 
  private:
+  void open(const std::string& path);
+
   std::string path_;
-  rosbag::Bag bag_;
+  std::deque<rosbag::Bag> bags_;         ///< in the order of the command line; a bag cannot move
   std::map<std::string, Topic> topics_;  ///< by name without leading slash
 };
 

@@ -16,7 +16,7 @@ BagFusion::BagFusion(const FuseBagOptions& options, void (*checkpoint)())
       rig_(loadRig(options.rig, options.overrides)),
       report_(rig_.cameras.size()),
       pipeline_(rig_),
-      input_(options.input),
+      input_(options.inputs),
       poses_(tfPoseSourceConfig(rig_, 0)),
       scans_(rig_, &drops_),
       models_(rig_.cameras.size()) {}
@@ -27,7 +27,7 @@ void BagFusion::run() {
   try {
     fuseInto(&output);
   } catch (const rosbag::BagException& e) {
-    throw Error(bagErrorText(options_.input, e));
+    throw Error(bagErrorText(input_.path(), e));
   }
   output.commit();
 }
@@ -52,7 +52,7 @@ void BagFusion::fuseInto(BagOutput* output) {
   if (options_.tf) writer.copyTransforms();
   if (report_.scansWritten() == 0) {
     const std::size_t count = index_.scans.size();
-    throw Error(options_.input + ": none of its " + std::to_string(count) + " scan" +
+    throw Error(input_.path() + ": none of its " + std::to_string(count) + " scan" +
                 (count == 1 ? "" : "s") + " can be used");
   }
 }
@@ -117,7 +117,7 @@ void BagFusion::fuseScan(const BagScan& scan, ImageSource* images, ProductWriter
   writer->writeScan(scan.times.interval.first_ns, scan.image_stamps, rigid.cloud, result.cloud);
   if (options_.all) writer->writeOverlays(result, used, views, rigid.cloud.stamp);
   report_.countScan(result.cloud.points);
-  countDrops(scan, rigid, result);
+  countDrops(scan, T_vehicle_lidar || !rig_.motion_enabled, rigid, result);
 }
 
 /// The time at which the camera_info in force is that of a scan's image.
@@ -144,9 +144,11 @@ void BagFusion::countCamera(const BagScan& scan, std::size_t camera, bool has_im
   }
 }
 
-void BagFusion::countDrops(const BagScan& scan, const CompensationResult& rigid,
-                           const FusionResult& result) {
-  if (!rigid.counters.reference_covered) {
+void BagFusion::countDrops(const BagScan& scan, bool has_vehicle_extrinsics,
+                           const CompensationResult& rigid, const FusionResult& result) {
+  if (!has_vehicle_extrinsics) {
+    drops_.add("scans: no extrinsics of the lidar", 1);  // said when they were looked for
+  } else if (!rigid.counters.reference_covered) {
     drops_.count("scans: odometry does not cover t_ref",
                  poses_.gap(scan.reference_ns, scan.reference_ns));
   } else if (rigid.counters.marked_points + rigid.counters.dropped_points > 0) {
@@ -205,6 +207,15 @@ std::optional<Transform> BagFusion::extrinsics(const std::string& target, const 
   if (!answer) DropLog::warn("no extrinsics " + answer.message + "; " + consequence);
   extrinsics_[key] = answer.transform;
   return answer.transform;
+}
+
+std::string BagFusion::whyNothingIsFused() const {
+  if (rig_.cameras.empty() || report_.fusedPoints() > 0) return {};
+  std::string text = input_.path() + ": no point got a class: " + report_.commonestStatus();
+  for (const auto& drop : drops_.counts()) {
+    text += "; " + drop.first + ": " + std::to_string(drop.second);
+  }
+  return text + ". " + options_.output + " is written; check_rig.py looks for the cause";
 }
 
 std::string BagFusion::summary() const {

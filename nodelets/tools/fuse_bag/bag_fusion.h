@@ -36,6 +36,8 @@ class BagFusion {
   void run();
   /// What came in, what came out, and what was dropped and why.
   std::string summary() const;
+  /// Why no point got a class though the rig has cameras; empty if one did.
+  std::string whyNothingIsFused() const;
 
  private:
   void fuseInto(BagOutput* output);
@@ -44,7 +46,8 @@ class BagFusion {
   void fuseScan(const BagScan& scan, ImageSource* images, ProductWriter* writer);
   ros::Time infoTime(const BagScan& scan, std::size_t camera) const;
   void countCamera(const BagScan& scan, std::size_t camera, bool has_image, const CameraView& view);
-  void countDrops(const BagScan& scan, const CompensationResult& rigid, const FusionResult& result);
+  void countDrops(const BagScan& scan, bool has_vehicle_extrinsics, const CompensationResult& rigid,
+                  const FusionResult& result);
 
   CameraPlace place(std::size_t camera, const ros::Time& time, const std::string& lidar_frame);
   std::shared_ptr<const CameraModel> model(std::size_t camera, const CameraInfo& info);

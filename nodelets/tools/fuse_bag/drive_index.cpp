@@ -6,7 +6,11 @@
 #include <tf2_msgs/TFMessage.h>
 
 #include <algorithm>
+#include <cmath>
+#include <cstdio>
 #include <functional>
+#include <iterator>
+#include <limits>
 #include <tuple>
 
 #include "edge/conversions.h"
@@ -32,7 +36,7 @@ std::string findTopic(const BagInput& input, const std::string& topic, const std
                " is wanted; " + input.candidates(datatype);
     return {};
   }
-  return found->name;
+  return bareTopic(found->name);
 }
 
 template <typename Message>
@@ -144,7 +148,7 @@ class Router {
 
   void addPoses() {
     if (const BagInput::Topic* tf = input_.find("/tf")) {
-      handlers_[tf->name].push_back(
+      handlers_[bareTopic(tf->name)].push_back(
           [this](const rosbag::MessageInstance& m) { addTransforms(m, false); });
     }
     if (rig_.odometry.source != OdometrySource::kTopic) return;
@@ -185,6 +189,40 @@ class Router {
   std::map<std::string, std::vector<Handler>> handlers_;
 };
 
+/// Scores and images belong together by their stamps. Says how far apart they are if none do.
+void comparePairs(const CameraConfig& camera, const CameraTrack& track, DropLog* drops) {
+  if (track.images.empty() || track.semantics.empty()) return;
+  std::uint64_t alone = 0;
+  StampNs nearest = std::numeric_limits<StampNs>::max();
+  for (const auto& semantics : track.semantics) {
+    const StampNs stamp = semantics.first;
+    const auto after = track.images.lower_bound(stamp);
+    if (after != track.images.end() && after->first == stamp) continue;
+    ++alone;
+    const auto consider = [&](StampNs image) {
+      if (std::abs(stamp - image) < std::abs(nearest)) nearest = stamp - image;
+    };
+    if (after != track.images.end()) consider(after->first);
+    if (after != track.images.begin()) consider(std::prev(after)->first);
+  }
+  const std::string name = semanticsName(camera.input);
+  const std::string reason =
+      "camera " + camera.name + ": " + name + " without an image of their stamp";
+  if (alone < track.semantics.size()) {
+    drops->add(reason, alone);
+    return;
+  }
+  char difference[32];
+  std::snprintf(difference, sizeof(difference), "%.6f",
+                1e-6 * static_cast<double>(std::abs(nearest)));
+  drops->count(reason,
+               "camera " + camera.name + ": none of the " + std::to_string(alone) + " " + name +
+                   " carries the stamp of an image; the nearest is " + difference + " ms " +
+                   (nearest > 0 ? "after" : "before") +
+                   " one. Copy the header of the image in the node that makes them",
+               alone);
+}
+
 }  // namespace
 
 DriveIndex indexDrive(const BagInput& input, const Rig& rig, TfPoseSource* poses, DropLog* drops,
@@ -205,7 +243,8 @@ DriveIndex indexDrive(const BagInput& input, const Rig& rig, TfPoseSource* poses
   };
 
   if (const BagInput::Topic* tf_static = input.find("/tf_static")) {
-    rosbag::View statics(input.bag(), rosbag::TopicQuery(tf_static->name));
+    rosbag::View statics;
+    input.addTo({tf_static->name}, &statics);
     for (const rosbag::MessageInstance& message : statics) {
       guarded(message, [&](const rosbag::MessageInstance& m) { router.addTransforms(m, true); });
     }
@@ -213,15 +252,19 @@ DriveIndex indexDrive(const BagInput& input, const Rig& rig, TfPoseSource* poses
 
   std::vector<std::string> topics;
   for (const auto& handler : router.handlers()) topics.push_back(handler.first);
-  rosbag::View view(input.bag(), rosbag::TopicQuery(topics));
+  rosbag::View view;
+  input.addTo(topics, &view);
   ProgressBar progress("indexing", view.size(), show_progress);
   std::size_t done = 0;
   for (const rosbag::MessageInstance& message : view) {
-    for (const Handler& handle : router.handlers().at(message.getTopic())) {
+    for (const Handler& handle : router.handlers().at(bareTopic(message.getTopic()))) {
       guarded(message, handle);
     }
     progress.update(++done);
     checkpoint();
+  }
+  for (std::size_t c = 0; c < index.cameras.size(); ++c) {
+    comparePairs(rig.cameras[c], index.cameras[c], drops);
   }
   poses->odometry();
   for (const std::string& note : poses->takeNotes()) DropLog::warn("tf: " + note);

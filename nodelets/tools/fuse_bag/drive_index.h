@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: MIT
-/// What a rig needs of a bag, found in one pass: where its scans, images and scores stand, its
+/// What a rig needs of the bags, found in one pass: where its scans, images and scores stand, its
 /// camera_infos, and all poses. Pixels and points are not decoded.
 #pragma once
 

@@ -44,12 +44,16 @@ void print(const std::string& text) {
 }
 
 void fuse(const FuseBagOptions& options) {
-  if (sameFile(options.input, options.output) || sameFile(options.input, options.output + ".tmp")) {
-    throw Error(options.output + ": is the input bag itself");
+  for (const std::string& input : options.inputs) {
+    if (sameFile(input, options.output)) {
+      throw Error(options.output + ": is the input bag itself");
+    }
   }
   BagFusion fusion(options, endIfInterrupted);
   fusion.run();
   if (!options.quiet) std::fputs(fusion.summary().c_str(), stdout);
+  const std::string failure = fusion.whyNothingIsFused();
+  if (!failure.empty()) throw Error(failure);
 }
 
 int run(const std::vector<std::string>& arguments) {

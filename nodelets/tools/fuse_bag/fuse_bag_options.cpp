@@ -4,13 +4,14 @@
 namespace semantic_lidar_fusion {
 
 const char kFuseBagUsage[] =
-    R"(usage: fuse_bag IN.bag OUT.bag --rig FILE [options]
+    R"(usage: fuse_bag IN.bag [IN.bag ...] OUT.bag --rig FILE [options]
        fuse_bag --print-rig --rig FILE [--set KEY=VALUE]
 
 Transfers camera semantics to the lidar points of a bag: the whole pipeline, without a ROS master,
 as fast as the machine allows. The same input gives the same bytes.
 
-  IN.bag           lidar, camera_info, tf (or odometry), images and scores
+  IN.bag           lidar, camera_info, tf (or odometry), images and scores; several bags are one
+                   drive (rosbag record --split, images or tf_static apart)
   OUT.bag          /scan_reference, /points_compensated, /points_semantic, /class_info,
                    /configuration (the rig as used) and for each camera /<camera>/selection
 
@@ -29,7 +30,8 @@ options:
   --version        print the version
   --help           this text
 
-Exit codes: 0 done; 1 failed, and OUT.bag is as before; 2 wrong command line.
+Exit codes: 0 done; 1 failed (then OUT.bag is as before), or done, but no point got a class though
+the rig has cameras; 2 wrong command line.
 )";
 
 FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
@@ -90,19 +92,20 @@ FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
       throw UsageError("unknown option " + argument);
     }
   }
-  if (options.rig.empty() && (options.print_rig || files.size() == 2)) {
+  if (options.rig.empty() && (options.print_rig || files.size() >= 2)) {
     throw UsageError("--rig FILE is wanted");
   }
   if (options.print_rig) {
     if (!files.empty()) throw UsageError("--print-rig takes no bag; " + files[0] + " was given");
     return options;
   }
-  if (files.size() != 2) {
+  if (files.size() < 2) {
     throw UsageError("IN.bag and OUT.bag are wanted; " + std::to_string(files.size()) +
-                     " file names were given");
+                     " file name" + (files.size() == 1 ? " was" : "s were") + " given");
   }
-  options.input = files[0];
-  options.output = files[1];
+  options.output = files.back();
+  files.pop_back();
+  options.inputs = files;
   return options;
 }
 

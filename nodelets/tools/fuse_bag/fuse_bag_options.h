@@ -9,7 +9,7 @@
 namespace semantic_lidar_fusion {
 
 struct FuseBagOptions {
-  std::string input;
+  std::vector<std::string> inputs;  ///< the bags of one drive
   std::string output;
   std::string rig;
   std::vector<std::string> overrides;  ///< --set key=value

@@ -27,6 +27,12 @@ void RunReport::countScan(const Cloud& semantic) {
   for (std::size_t s = 0; s < by_status.size(); ++s) by_status_[s] += by_status[s];
 }
 
+std::string RunReport::commonestStatus() const {
+  const auto most = std::max_element(by_status_.begin(), by_status_.end());
+  return percent(*most, points_) + " of " + count(points_, "point") + ": " +
+         kPointStatusNames[static_cast<std::size_t>(most - by_status_.begin())];
+}
+
 std::string RunReport::text(const Input& input, const DropLog& drops) const {
   std::string text = input.output + ": " + count(scans_, "scan") + " of " +
                      std::to_string(input.scans) + ", " + count(points_, "point") + " (";

@@ -39,7 +39,8 @@ VisibilityTruth::VisibilityTruth(const BagInput& input, StampNs offset_ns) {
   if (topic == nullptr) {
     throw Error(input.path() + ": no " + kTopic + "; --truth visibility takes it from there");
   }
-  view_ = std::make_unique<rosbag::View>(input.bag(), rosbag::TopicQuery(topic->name));
+  view_ = std::make_unique<rosbag::View>();
+  input.addTo({topic->name}, view_.get());
   for (const rosbag::MessageInstance& message : *view_) {
     const auto stamped = message.instantiate<StampedMessage>();
     if (stamped) scans_.emplace(stampNs(stamped->header.stamp) + offset_ns, message);
