@@ -29,6 +29,7 @@ class SphereLens : public Lens {
 
   std::optional<Eigen::Vector2d> project(const Eigen::Vector3d& p) const override {
     const Inner inner = innerOf(p);
+    if (!std::isfinite(inner.d1 + inner.d2)) return std::nullopt;  // squares overflow
     if (!(inner.d1 > 0.0 && inner.z > least_inner_ * inner.d2 && p.z() > least_outer_ * inner.d1 &&
           angleFromAxis(p) <= max_theta_rad_)) {
       return std::nullopt;

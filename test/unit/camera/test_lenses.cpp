@@ -147,6 +147,20 @@ TEST(Lenses, NoPointFoldsInAndEveryRayLeadsBack) {
   }
 }
 
+TEST(Lenses, PointsWhoseSquaresOverflowDoNotFoldIn) {
+  for (const auto& one : lenses()) {
+    const auto lens = makeLens(one.model, one.d);
+    for (const Eigen::Vector3d& p :
+         {Eigen::Vector3d(1e200, 1.0, 1e-200), Eigen::Vector3d(-3e170, 4e170, 1e170)}) {
+      const auto a = lens->project(p);
+      if (!a || !a->allFinite()) continue;
+      const auto same = lens->project(p / p.stableNorm());
+      ASSERT_TRUE(same) << nameOf(one);
+      EXPECT_LT((*a - *same).norm(), 1e-9 * (1.0 + same->norm())) << nameOf(one);
+    }
+  }
+}
+
 TEST(Lenses, RandomCoefficientsKeepThePromise) {
   std::mt19937 random(2);
   std::uniform_real_distribution<double> unit(0.0, 1.0);
