@@ -36,7 +36,7 @@ def main():
     from semantic_lidar_fusion.rig import Rig
 
     rig = Rig.load(options.rig, options.overrides.split())
-    names = TOPICS + [str(c["namespace"]).strip("/") + "/selection" for c in rig.tree["cameras"]]
+    names = TOPICS + [str(c["name"]) + "/selection" for c in rig.tree["cameras"]]
     if rig.text("odometry.source") == "topic":
         names.append(rig.text("odometry.topic"))
     # A recorder writes names as they are given; those of a bag are absolute.

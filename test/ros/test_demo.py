@@ -56,9 +56,9 @@ class Demo(live.ReplayCase):
             self.assert_same(clouds_of(fused), list(clouds_of(recorded).values()))
             self.assertEqual(len(clouds_of(fused)), 6)
 
-            clouds = "--clouds=motion_mask=" + fused
+            clouds = "--clouds=package=" + fused
             run("evaluate.py", bag, "--rig=" + RIG, clouds, "--out=" + offline, *settings)
-            for name in ("table1.csv", "summary.csv", "confusion_motion_mask.csv"):
+            for name in ("table1.csv", "summary.csv", "confusion_package.csv"):
                 with open(os.path.join(online, name)) as a, open(os.path.join(offline, name)) as b:
                     self.assertEqual(a.read(), b.read(), name)
 

@@ -212,7 +212,7 @@ def _missing_links(player: str, manager: str, rig: Rig, recorded: bool) -> List[
         missing.append("%s on %s" % (recorder, output))
     if listeners.get(output):
         inner = ["scan_reference", "points_compensated"]
-        inner += [str(c["namespace"]).strip("/") + "/selection" for c in rig.tree["cameras"]]
+        inner += [str(c["name"]) + "/selection" for c in rig.tree["cameras"]]
         for topic in map(rospy.resolve_name, inner):
             if (manager, topic) not in from_manager:
                 missing.append("%s on %s" % (manager, topic))
