@@ -146,8 +146,9 @@ class RadtanLens : public Lens {
   std::optional<Eigen::Vector2d> project(const Eigen::Vector3d& p) const override {
     const double d1 = xi_ == 0.0 ? 0.0 : p.stableNorm();  // squares of large points overflow
     if (!(p.z() > least_cosine_ * d1)) return std::nullopt;
-    const Eigen::Vector2d a = p.head<2>() / (p.z() + xi_ * d1);
-    if (!(a.norm() <= max_radius_)) return std::nullopt;
+    const double depth = p.z() + xi_ * d1;
+    const Eigen::Vector2d a = p.head<2>() / depth;
+    if (!(depth < kInfinity && a.norm() <= max_radius_)) return std::nullopt;
     return bending_.none() ? a : bending_.apply(a);
   }
 

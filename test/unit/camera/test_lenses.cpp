@@ -151,7 +151,8 @@ TEST(Lenses, PointsWhoseSquaresOverflowDoNotFoldIn) {
   for (const auto& one : lenses()) {
     const auto lens = makeLens(one.model, one.d);
     for (const Eigen::Vector3d& p :
-         {Eigen::Vector3d(1e200, 1.0, 1e-200), Eigen::Vector3d(-3e170, 4e170, 1e170)}) {
+         {Eigen::Vector3d(1e200, 1.0, 1e-200), Eigen::Vector3d(-3e170, 4e170, 1e170),
+          Eigen::Vector3d(-9.8e307, 1.0, 1e-200)}) {
       const auto a = lens->project(p);
       if (!a || !a->allFinite()) continue;
       const auto same = lens->project(p / p.stableNorm());
