@@ -4,6 +4,7 @@
 
 One manager serves all cases, in the order of their names; its process id must not change.
 """
+import itertools
 import json
 import os
 import sys
@@ -20,6 +21,8 @@ from rosgraph_msgs.msg import Log  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
+# One more than make an epoch, so that the loss of one is no matter of time.
+SCANS = 3
 NODELETS = ("image_selection", "superpixel_uncertainty", "motion_compensation", "projection")
 
 
@@ -32,7 +35,7 @@ class Trouble(unittest.TestCase):
         cls.diagnostics = live.Diagnostics()
         cls.context = live.folder()
         cls.folder = cls.context.__enter__()
-        cls.drive = Drive(scans=2, points_per_scan=1600)
+        cls.drive = Drive(scans=SCANS, points_per_scan=1600)
         cls.made = live.Made(cls.folder, cls.drive)
         cls.expected = cls.made.fused()
         cls.feed = live.Feed(cls.made)
@@ -55,7 +58,7 @@ class Trouble(unittest.TestCase):
     def tearDown(self):
         self.assertEqual(live.pid_of(live.MANAGER), self.pid, "the manager has died")
 
-    def run_drive(self, change=None, scans=2):
+    def run_drive(self, change=None, scans=SCANS):
         self.semantic.clear()
         self.feed.publish(self.feed.next_drive(), change)
         return [read_cloud(m) for m in self.semantic.wait_for(scans)[:scans]]
@@ -64,7 +67,7 @@ class Trouble(unittest.TestCase):
         """An unchanged drive gives what fuse_bag gives."""
         self.semantic.clear()
         self.feed.publish(self.feed.next_drive())
-        received = self.semantic.wait_for(2)
+        received = self.semantic.wait_for(SCANS)
         self.assertEqual(len(received), len(self.expected))
         for message, stamp in zip(received, sorted(self.expected)):
             ours, theirs = read_cloud(message), read_cloud(self.expected[stamp])
@@ -129,7 +132,7 @@ class Trouble(unittest.TestCase):
 
         for cloud in self.run_drive(change):
             self.assertEqual(set(cloud["cameras"][cloud["status"] == 0]), {1})
-        self.said.wait_for(r"/left/image_selected: .*klingon16", Log.ERROR)
+        self.said.wait_for(r"left image_selected: .*klingon16", Log.ERROR)
         self.assert_good()
 
     def test_05_image_whose_data_is_cut_off(self):
@@ -162,18 +165,20 @@ class Trouble(unittest.TestCase):
                 message.point_step = 7
             return message
 
-        self.assertEqual(len(self.run_drive(change, scans=1)), 1)
+        self.assertEqual(len(self.run_drive(change, scans=SCANS - 1)), SCANS - 1)
         self.said.wait_for(r"/points: .*", Log.ERROR)
         self.assert_good()
 
     def test_08_empty_cloud_gives_an_empty_cloud(self):
+        scan = itertools.count()
+
         def change(topic, message):
-            if topic == "/points":
+            if topic == "/points" and next(scan) == 1:
                 message.width, message.row_step, message.data = 0, 0, b""
             return message
 
-        for cloud in self.run_drive(change):
-            self.assertEqual(len(cloud), 0)
+        sizes = sorted(len(cloud) for cloud in self.run_drive(change))
+        self.assertEqual([size > 0 for size in sizes], [False, True, True], sizes)
         self.assert_good()
 
     def test_09_image_with_stamp_zero(self):
@@ -202,7 +207,7 @@ class Trouble(unittest.TestCase):
         for nodelet in NODELETS:
             text = rospy.wait_for_message("/%s/configuration" % nodelet, String, 20.0).data
             known = yaml.safe_load(text)
-            self.assertRegex(known["version"], r"^\d+\.\d+\.\d+$")
+            self.assertRegex(text, r"^# semantic_lidar_fusion \d+\.\d+\.\d+\n")
             self.assertEqual(known["name"], "room")
             # Of an override, not of the file.
             self.assertEqual(float(known["reference"]["timeout"]), 3.0)
