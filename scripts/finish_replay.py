@@ -3,7 +3,6 @@
 """Waits for the end of a replay and its last scans, says what came out and what was dropped, ends
 the recorder, and evaluates what it wrote. replay.launch starts it; its exit ends the launch."""
 
-import argparse
 import atexit
 import os
 import sys
@@ -14,14 +13,7 @@ from semantic_lidar_fusion import cli  # noqa: E402
 
 
 def make_parser():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rig", metavar="FILE", required=True, help="the rig file of the replay")
-    parser.add_argument(
-        "--overrides",
-        metavar="TEXT",
-        default="",
-        help="changes to the rig file, key=value, separated by blanks",
-    )
+    parser = cli.replay_parser(__doc__)
     parser.add_argument(
         "--recorded", metavar="BAG", default="", help="what the node `recorder` writes, if it runs"
     )
@@ -41,8 +33,7 @@ def make_parser():
 
 def main():
     parser = make_parser()
-    # roslaunch adds __name:=... and __log:=...
-    options = parser.parse_args([a for a in sys.argv[1:] if not a.startswith("__")])
+    options = parser.parse_args(cli.node_arguments())
     if options.evaluate and not (options.bag and options.recorded):
         parser.error("--evaluate needs --bag and --recorded")
     cli.require("numpy", "yaml", "rospy", "rosgraph")

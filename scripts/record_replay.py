@@ -15,14 +15,7 @@ TOPICS = ["points_semantic", "points_compensated", "scan_reference", "class_info
 
 
 def make_parser():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rig", metavar="FILE", required=True, help="the rig file of the replay")
-    parser.add_argument(
-        "--overrides",
-        metavar="TEXT",
-        default="",
-        help="changes to the rig file, key=value, separated by blanks",
-    )
+    parser = cli.replay_parser(__doc__)
     parser.add_argument("command", nargs=argparse.REMAINDER, help="the command")
     return parser
 

@@ -3,7 +3,6 @@
 """Lets the player of a replay go once every link of the chain and the recorder are connected.
 replay.launch starts it beside a player that waits."""
 
-import argparse
 import os
 import sys
 
@@ -13,14 +12,7 @@ from semantic_lidar_fusion import cli  # noqa: E402
 
 
 def make_parser():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rig", metavar="FILE", required=True, help="the rig file of the replay")
-    parser.add_argument(
-        "--overrides",
-        metavar="TEXT",
-        default="",
-        help="changes to the rig file, key=value, separated by blanks",
-    )
+    parser = cli.replay_parser(__doc__)
     parser.add_argument(
         "--manager", metavar="NODE", default="fusion_manager", help="the nodelet manager"
     )
@@ -43,8 +35,7 @@ def make_parser():
 
 
 def main():
-    # roslaunch adds __name:=... and __log:=...
-    options = make_parser().parse_args([a for a in sys.argv[1:] if not a.startswith("__")])
+    options = make_parser().parse_args(cli.node_arguments())
     cli.require("numpy", "yaml", "rospy", "rosgraph", "genpy")
     from semantic_lidar_fusion.bags import replay
 

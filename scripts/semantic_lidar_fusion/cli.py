@@ -11,7 +11,7 @@ import signal
 import sys
 import traceback
 from types import FrameType
-from typing import Callable, Iterable, Iterator, Optional, TypeVar
+from typing import Callable, Iterable, Iterator, List, Optional, TypeVar
 
 from semantic_lidar_fusion.errors import MissingDependencyError, SemanticLidarFusionError
 
@@ -71,6 +71,24 @@ def _where(error: BaseException) -> str:
     ours = [p for p in places if p.filename.startswith(package) and p.filename != __file__]
     ours = ours or places
     return "%s:%d" % (os.path.basename(ours[-1].filename), ours[-1].lineno or 0)
+
+
+def replay_parser(description: Optional[str]) -> argparse.ArgumentParser:
+    """The parser of a command that replay.launch starts, with the rig and its changes."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--rig", metavar="FILE", required=True, help="the rig file of the replay")
+    parser.add_argument(
+        "--overrides",
+        metavar="TEXT",
+        default="",
+        help="changes to the rig file, key=value, separated by blanks",
+    )
+    return parser
+
+
+def node_arguments() -> List[str]:
+    """The command's own arguments, without the __name:=... and __log:=... that roslaunch adds."""
+    return [argument for argument in sys.argv[1:] if not argument.startswith("__")]
 
 
 def run(main: Callable[[], Optional[int]]) -> None:
