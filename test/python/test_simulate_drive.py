@@ -415,6 +415,9 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 def test_wrong_command_lines_are_named(tmp_path):
     for options, words in (
         (["--speed", "50"], ["--speed", "'50'", "5 to 15"]),
+        (["--speed=51"], ["--speed", "'51'", "5 to 15"]),
+        (["--static=1"], ["unknown option --static=1"]),
+        (["--", "--static"], ["unknown argument --static"]),
         (["--duration", "x"], ["--duration", "'x'"]),
         (["--images", "some"], ["--images", "'some'"]),
         (["--image-choice", "best"], ["--image-choice", "'best'", "closest_to_sweep"]),

@@ -36,62 +36,20 @@ the rig has cameras; 2 wrong command line.
 
 FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
   FuseBagOptions options;
-  std::vector<std::string> files;
-  bool only_files = false;
-  for (std::size_t i = 0; i < arguments.size(); ++i) {
-    const std::string& argument = arguments[i];
-    if (only_files || argument.size() < 2 || argument[0] != '-') {
-      files.push_back(argument);
-      continue;
+  OptionReader reader(&options);
+  reader.text("--rig", &options.rig);
+  reader.value("--set", [&](const std::string& value) {
+    if (value.find('=') == std::string::npos) {
+      throw UsageError("--set " + value + ": KEY=VALUE is wanted");
     }
-    const std::size_t equals = argument.find('=');
-    const std::string name = argument.substr(0, equals);
-    const bool takes_value = name == "--rig" || name == "--set" || name == "--truth";
-    if (!takes_value && equals != std::string::npos) {
-      throw UsageError("unknown option " + argument);
-    }
-    std::string value;
-    if (takes_value) {
-      if (equals != std::string::npos) {
-        value = argument.substr(equals + 1);
-      } else if (++i < arguments.size()) {
-        value = arguments[i];
-      } else {
-        throw UsageError(name + " needs a value");
-      }
-    }
-    if (name == "--") {
-      only_files = true;
-    } else if (name == "--rig") {
-      options.rig = value;
-    } else if (name == "--set") {
-      if (value.find('=') == std::string::npos) {
-        throw UsageError("--set " + value + ": KEY=VALUE is wanted");
-      }
-      options.overrides.push_back(value);
-    } else if (name == "--truth") {
-      if (value != "visibility") throw UsageError("--truth " + value + ": must be visibility");
-      options.true_visibility = true;
-    } else if (name == "--all") {
-      options.all = true;
-    } else if (name == "--tf") {
-      options.tf = true;
-    } else if (name == "--force") {
-      options.force = true;
-    } else if (name == "--quiet" || name == "-q") {
-      options.quiet = true;
-    } else if (name == "--print-rig") {
-      options.print_rig = true;
-    } else if (name == "--version") {
-      options.version = true;
-      return options;
-    } else if (name == "--help" || name == "-h") {
-      options.help = true;
-      return options;
-    } else {
-      throw UsageError("unknown option " + argument);
-    }
-  }
+    options.overrides.push_back(value);
+  });
+  reader.choice<bool>("--truth", {{"visibility", true}}, &options.true_visibility);
+  reader.flag("--all", &options.all);
+  reader.flag("--tf", &options.tf);
+  reader.flag("--print-rig", &options.print_rig);
+  std::vector<std::string> files = reader.read(arguments);
+  if (options.help || options.version) return options;
   if (options.rig.empty() && (options.print_rig || files.size() >= 2)) {
     throw UsageError("--rig FILE is wanted");
   }

@@ -2,13 +2,14 @@
 /// The command line of fuse_bag.
 #pragma once
 
-#include <stdexcept>
 #include <string>
 #include <vector>
 
+#include "tools/common/command_line.h"
+
 namespace semantic_lidar_fusion {
 
-struct FuseBagOptions {
+struct FuseBagOptions : CommonOptions {
   std::vector<std::string> inputs;  ///< the bags of one drive
   std::string output;
   std::string rig;
@@ -16,17 +17,7 @@ struct FuseBagOptions {
   bool true_visibility = false;        ///< --truth visibility
   bool all = false;
   bool tf = false;
-  bool force = false;
-  bool quiet = false;
   bool print_rig = false;
-  bool version = false;
-  bool help = false;
-};
-
-/// The command line is wrong; what() says how.
-class UsageError : public std::runtime_error {
- public:
-  using std::runtime_error::runtime_error;
 };
 
 /// Throws UsageError.

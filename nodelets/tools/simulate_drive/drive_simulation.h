@@ -6,13 +6,14 @@
 #include <string>
 
 #include "semantic_lidar_fusion/sync/scan_selector.h"
+#include "tools/common/command_line.h"
 #include "tools/simulate_drive/errors.h"
 #include "tools/simulate_drive/exposure.h"
 
 namespace semantic_lidar_fusion {
 namespace simulator {
 
-struct SimulationOptions {
+struct SimulationOptions : CommonOptions {
   std::string output;
   double duration_s = 2.0;
   double speed_mps = 10.0;
@@ -29,10 +30,6 @@ struct SimulationOptions {
   ImageChoice image_choice = ImageChoice::kClosestToReference;  ///< that scans are taken to make
   bool all_images = false;  ///< else only those that a scan uses
   bool raw_images = false;  ///< else JPEG
-  bool force = false;
-  bool quiet = false;
-  bool version = false;
-  bool help = false;
   int threads = 2;
   std::string pictures;  ///< folder for PNG files of the first used image of each camera
 };

@@ -1,20 +1,11 @@
 // SPDX-License-Identifier: MIT
 /// simulate_drive: a drive of known truth as a bag. See kUsage.
-#include <console_bridge/console.h>
-
-#include <cmath>
-#include <csignal>
-#include <cstdio>
-#include <cstdlib>
-#include <exception>
-#include <limits>
-#include <stdexcept>
 #include <string>
-#include <utility>
 #include <vector>
 
-#include "edge/version.h"
+#include "tools/common/command_line.h"
 #include "tools/simulate_drive/drive_simulation.h"
+#include "tools/simulate_drive/rig.h"
 
 namespace semantic_lidar_fusion {
 namespace simulator {
@@ -81,206 +72,81 @@ options:
 Exit codes: 0 done; 1 failed, and BAG is as before; 2 wrong command line.
 )";
 
-volatile std::sig_atomic_t caught_signal = 0;
-
-void rememberSignal(int signal) { caught_signal = signal; }
-
-/// A signal asked for the end; what was written is removed on the way out.
-struct Interrupted {};
-
-void endIfInterrupted() {
-  if (caught_signal != 0) throw Interrupted();
+void addVehicleOptions(OptionReader* reader, SimulationOptions* options) {
+  reader->number("--duration", 0.2, 300.0, &options->duration_s);
+  reader->number("--speed", 5.0, 15.0, &options->speed_mps);
+  reader->wholeNumber("--seed", 0.0, 1e15, &options->seed);
+  reader->number("--scale", 0.1, 1.0, &options->scale);
+  reader->value("--width", [options](const std::string& width) {
+    options->scale = wholeNumberOf("--width", width, 192.0, kFullWidth) / kFullWidth;
+  });
+  reader->number("--camera-drop", -1.0, 1.2, &options->camera_drop_m);
+  reader->number("--lidar-offset", -1.0, 1.2, &options->camera_drop_m);
+  reader->number("--image-rate", 1.0, 100.0, &options->image_rate_hz);
 }
 
-class UsageError : public std::runtime_error {
- public:
-  using std::runtime_error::runtime_error;
-};
-
-double number(const std::string& name, const std::string& text, double least, double most) {
-  char* end = nullptr;
-  const double value = std::strtod(text.c_str(), &end);
-  if (text.empty() || *end != '\0' || !(value >= least && value <= most)) {
-    char range[80];
-    std::snprintf(range, sizeof range, "%g to %g", least, most);
-    throw UsageError(name + " is '" + text + "'; it must be a number from " + range);
-  }
-  return value;
+void addShutterOptions(OptionReader* reader, Shutter* shutter) {
+  reader->number("--readout", 0.0, 0.1, &shutter->readout_s);
+  reader->choice<ReadoutWay>("--shutter-direction",
+                             {{"down", ReadoutWay::kDown},
+                              {"up", ReadoutWay::kUp},
+                              {"right", ReadoutWay::kRight},
+                              {"left", ReadoutWay::kLeft}},
+                             &shutter->way);
+  reader->choice<double>("--stamp-row", {{"first", 0.0}, {"middle", 0.5}, {"last", 1.0}},
+                         &shutter->stamp_at);
 }
 
-double wholeNumber(const std::string& name, const std::string& text, double least, double most) {
-  const double value = number(name, text, least, most);
-  if (value != std::floor(value))
-    throw UsageError(name + " is '" + text + "'; it must be a whole number");
-  return value;
-}
-
-/// As many numbers as `most` has, between commas; each from 0 to its own of `most`.
-std::vector<double> numbers(const std::string& name, const std::string& text,
-                            const std::vector<double>& most) {
-  std::vector<std::string> parts(1);
-  for (const char c : text) {
-    if (c == ',') {
-      parts.emplace_back();
-    } else {
-      parts.back() += c;
-    }
-  }
-  if (parts.size() != most.size()) {
-    throw UsageError(name + " is '" + text + "'; it must be " + std::to_string(most.size()) +
-                     " numbers with commas between them");
-  }
-  std::vector<double> values;
-  for (std::size_t i = 0; i < most.size(); ++i) {
-    values.push_back(number(name, parts[i], 0.0, most[i]));
-  }
-  return values;
-}
-
-template <typename Value>
-Value choice(const std::string& name, const std::string& text,
-             const std::vector<std::pair<std::string, Value>>& values) {
-  std::string known;
-  for (const auto& value : values) {
-    if (value.first == text) return value.second;
-    known += (known.empty() ? "" : ", ") + value.first;
-  }
-  throw UsageError(name + " is '" + text + "'; it must be one of " + known);
+void addErrorOptions(OptionReader* reader, ErrorSizes* errors) {
+  reader->numbers("--extrinsic-error", {5.0, 0.5}, {&errors->rotation_deg, &errors->translation_m});
+  reader->numbers("--intrinsic-error", {0.05, 50.0}, {&errors->focal_share, &errors->centre_px});
+  reader->number("--stamp-jitter", 0.0, 0.02, &errors->stamp_s);
+  reader->numbers("--odometry-error", {5.0, 60.0, 100.0},
+                  {&errors->velocity_mps, &errors->rate_dps, &errors->correlation_s});
 }
 
 SimulationOptions parseOptions(const std::vector<std::string>& arguments) {
   SimulationOptions options;
-  std::size_t i = 0;
-  const auto value = [&]() -> const std::string& {
-    if (i + 1 >= arguments.size()) throw UsageError(arguments[i] + " needs a value");
-    return arguments[++i];
-  };
-  for (; i < arguments.size(); ++i) {
-    const std::string name = arguments[i];
-    if (name == "--out") {
-      options.output = value();
-    } else if (name == "--duration") {
-      options.duration_s = number(name, value(), 0.2, 300.0);
-    } else if (name == "--speed") {
-      options.speed_mps = number(name, value(), 5.0, 15.0);
-    } else if (name == "--seed") {
-      options.seed = static_cast<std::uint64_t>(wholeNumber(name, value(), 0.0, 1e15));
-    } else if (name == "--scale") {
-      options.scale = number(name, value(), 0.1, 1.0);
-    } else if (name == "--width") {
-      options.scale = wholeNumber(name, value(), 192.0, 1920.0) / 1920.0;
-    } else if (name == "--camera-drop" || name == "--lidar-offset") {
-      options.camera_drop_m = number(name, value(), -1.0, 1.2);
-    } else if (name == "--image-rate") {
-      options.image_rate_hz = number(name, value(), 1.0, 100.0);
-    } else if (name == "--images") {
-      const std::string& which = value();
-      if (which != "all" && which != "selected") {
-        throw UsageError("--images is '" + which + "'; it must be all or selected");
-      }
-      options.all_images = which == "all";
-    } else if (name == "--image-choice") {
-      const std::string& choice = value();
-      if (choice != "closest_to_reference" && choice != "closest_to_sweep") {
-        throw UsageError("--image-choice is '" + choice +
-                         "'; it must be closest_to_reference or closest_to_sweep");
-      }
-      options.image_choice = choice == "closest_to_sweep" ? ImageChoice::kClosestToSweep
-                                                          : ImageChoice::kClosestToReference;
-    } else if (name == "--readout") {
-      options.shutter.readout_s = number(name, value(), 0.0, 0.1);
-    } else if (name == "--shutter-direction") {
-      options.shutter.way = choice<ReadoutWay>(name, value(),
-                                               {{"down", ReadoutWay::kDown},
-                                                {"up", ReadoutWay::kUp},
-                                                {"right", ReadoutWay::kRight},
-                                                {"left", ReadoutWay::kLeft}});
-    } else if (name == "--stamp-row") {
-      options.shutter.stamp_at =
-          choice<double>(name, value(), {{"first", 0.0}, {"middle", 0.5}, {"last", 1.0}});
-    } else if (name == "--extrinsic-error") {
-      const auto sizes = numbers(name, value(), {5.0, 0.5});
-      options.errors.rotation_deg = sizes[0];
-      options.errors.translation_m = sizes[1];
-    } else if (name == "--intrinsic-error") {
-      const auto sizes = numbers(name, value(), {0.05, 50.0});
-      options.errors.focal_share = sizes[0];
-      options.errors.centre_px = sizes[1];
-    } else if (name == "--stamp-jitter") {
-      options.errors.stamp_s = number(name, value(), 0.0, 0.02);
-    } else if (name == "--odometry-error") {
-      const auto sizes = numbers(name, value(), {5.0, 60.0, 100.0});
-      options.errors.velocity_mps = sizes[0];
-      options.errors.rate_dps = sizes[1];
-      options.errors.correlation_s = sizes[2];
-      if (!(sizes[2] > 0.0)) throw UsageError(name + ": the correlation time must be above 0");
-    } else if (name == "--raw") {
-      options.raw_images = true;
-    } else if (name == "--static") {
-      options.moving = false;
-    } else if (name == "--perfect-network") {
-      options.perfect_network = true;
-    } else if (name == "--exact") {
-      options.perfect_network = options.exact_odometry = true;
-      options.range_noise = false;
-    } else if (name == "--threads") {
-      options.threads = static_cast<int>(wholeNumber(name, value(), 1.0, 64.0));
-    } else if (name == "--pictures") {
-      options.pictures = value();
-    } else if (name == "--force") {
-      options.force = true;
-    } else if (name == "--quiet") {
-      options.quiet = true;
-    } else if (name == "--version") {
-      options.version = true;
-      return options;
-    } else if (name == "--help" || name == "-h") {
-      options.help = true;
-      return options;
-    } else {
-      throw UsageError("unknown argument " + name);
-    }
-  }
+  bool standing = false, exact = false;
+  OptionReader reader(&options);
+  reader.text("--out", &options.output);
+  addVehicleOptions(&reader, &options);
+  reader.choice<bool>("--images", {{"all", true}, {"selected", false}}, &options.all_images);
+  reader.choice<ImageChoice>("--image-choice",
+                             {{"closest_to_reference", ImageChoice::kClosestToReference},
+                              {"closest_to_sweep", ImageChoice::kClosestToSweep}},
+                             &options.image_choice);
+  addShutterOptions(&reader, &options.shutter);
+  addErrorOptions(&reader, &options.errors);
+  reader.flag("--raw", &options.raw_images);
+  reader.flag("--static", &standing);
+  reader.flag("--perfect-network", &options.perfect_network);
+  reader.flag("--exact", &exact);
+  reader.wholeNumber("--threads", 1.0, 64.0, &options.threads);
+  reader.text("--pictures", &options.pictures);
+  const std::vector<std::string> others = reader.read(arguments);
+  if (options.help || options.version) return options;
+  if (!others.empty()) throw UsageError("unknown argument " + others[0]);
   if (options.output.empty()) throw UsageError("--out BAG is missing");
+  if (!(options.errors.correlation_s > 0.0)) {
+    throw UsageError("--odometry-error: the correlation time must be above 0");
+  }
+  options.moving = !standing;
+  if (exact) {
+    options.perfect_network = options.exact_odometry = true;
+    options.range_noise = false;
+  }
   return options;
 }
 
-int run(const std::vector<std::string>& arguments) {
-  try {
-    const SimulationOptions options = parseOptions(arguments);
-    if (options.help) {
-      std::fputs(kUsage, stdout);
-      return 0;
-    }
-    if (options.version) {
-      std::printf("simulate_drive %s\n", kVersion);
-      return 0;
-    }
-    simulateDrive(options, endIfInterrupted);
-    return 0;
-  } catch (const UsageError& e) {
-    std::fprintf(stderr, "simulate_drive: %s\nTry: simulate_drive --help\n", e.what());
-    return 2;
-  } catch (const Interrupted&) {
-    std::fprintf(stderr, "simulate_drive: interrupted; nothing was written\n");
-    return 128 + caught_signal;
-  } catch (const std::exception& e) {
-    std::fprintf(stderr, "simulate_drive: error: %s\n", e.what());
-    return 1;
-  }
-}
+void simulate(const SimulationOptions& options) { simulateDrive(options, endIfInterrupted); }
 
 }  // namespace
 }  // namespace simulator
 }  // namespace semantic_lidar_fusion
 
 int main(int argc, char** argv) {
-  // Libraries below report through exceptions too; their own lines would come twice.
-  console_bridge::setLogLevel(console_bridge::CONSOLE_BRIDGE_LOG_NONE);
-  struct sigaction action {};
-  action.sa_handler = semantic_lidar_fusion::simulator::rememberSignal;
-  ::sigaction(SIGINT, &action, nullptr);
-  ::sigaction(SIGTERM, &action, nullptr);
-  ::signal(SIGXFSZ, SIG_IGN);  // a file size limit is then an error of the write
-  return semantic_lidar_fusion::simulator::run(std::vector<std::string>(argv + 1, argv + argc));
+  using namespace semantic_lidar_fusion;
+  return runTool("simulate_drive", simulator::kUsage, simulator::parseOptions, simulator::simulate,
+                 argc, argv);
 }
