@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-/// The inner loop over score cells, plain and for wider registers (see slic_kernels.h for why the
-/// wide one has a file of its own).
+/// The inner loops over score cells and superpixel ids, plain and for wider registers (see
+/// slic_kernels.h for why the wide ones have a file of their own).
 #pragma once
 
 #include <cstdint>
@@ -10,14 +10,29 @@ namespace semantic_lidar_fusion {
 /// Label of a cell with a non-finite score.
 constexpr int kNoVote = -1;
 
-/// labels[i] = index of the highest of the `class_count` scores from scores[i * class_count], the
-/// lowest index of equal ones; kNoVote if one of them is not finite.
-using LabelCells = void (*)(const float* scores, int cell_count, int class_count, int* labels);
+struct ScoreKernels {
+  const char* name;
 
-void labelCellsPlain(const float* scores, int cell_count, int class_count, int* labels);
-void labelCellsAvx2(const float* scores, int cell_count, int class_count, int* labels);
+  /// labels[i] = class of the highest of the `class_count` scores of cell cells[i] of a row, the
+  /// lowest class of equal ones; kNoVote if one of them is not finite.
+  void (*labelFloats)(const float* row, const int* cells, int cell_count, int class_count,
+                      int* labels);
+  /// The same for integer scores. `flip`: each score counts as score ^ flip, so that all ones make
+  /// the lowest score win.
+  void (*labelBytes)(const std::uint8_t* row, const int* cells, int cell_count, int class_count,
+                     std::uint8_t flip, int* labels);
+  void (*labelWords)(const std::uint16_t* row, const int* cells, int cell_count, int class_count,
+                     std::uint16_t flip, int* labels);
+
+  /// Writes each place x in 0..count - 1 at which ids[x] or labels[x] differs from its left
+  /// neighbour, place 0 included, to `starts`, which has room for count + 8. Returns their number.
+  int (*segmentStarts)(const int* ids, const int* labels, int count, int* starts);
+};
+
+extern const ScoreKernels kPlainScoreKernels;
+extern const ScoreKernels kAvx2ScoreKernels;  ///< where SLF_HAVE_AVX2
 
 /// The fastest that the machine has.
-LabelCells labelCells();
+const ScoreKernels& scoreKernels();
 
 }  // namespace semantic_lidar_fusion

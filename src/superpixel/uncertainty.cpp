@@ -3,7 +3,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <numeric>
 #include <string>
+#include <vector>
 
 #include "score_kernels.h"
 #include "semantic_lidar_fusion/common/cell_grid.h"
@@ -27,9 +30,9 @@ struct Histogram {
         votes(static_cast<std::size_t>(superpixel_count) * class_count),
         totals(superpixel_count) {}
 
-  void add(int superpixel, int label) {
-    ++votes[static_cast<std::size_t>(superpixel) * class_count + label];
-    ++totals[superpixel];
+  void add(int superpixel, int label, int count) {
+    votes[static_cast<std::size_t>(superpixel) * class_count + label] += count;
+    totals[superpixel] += count;
   }
   const int* of(int superpixel) const {
     return &votes[static_cast<std::size_t>(superpixel) * class_count];
@@ -40,32 +43,126 @@ struct Histogram {
   std::vector<int> totals;
 };
 
-/// Lets every pixel of the map vote. `label_row(row, labels)` writes the labels of a whole source
-/// row, or kNoVote; it is asked once per needed row. Returns the votes withheld.
+/// The cells of a source row that the columns of a map read.
+struct SampledCells {
+  SampledCells(int map_width, int source_width)
+      : place(cellsUnderCentres(map_width, source_width)) {
+    for (int& cell : place) {
+      if (cells.empty() || cells.back() != cell) cells.push_back(cell);
+      cell = static_cast<int>(cells.size()) - 1;
+    }
+  }
+  std::vector<int> cells;  ///< each once, ascending
+  std::vector<int> place;  ///< of each column's cell in `cells`
+};
+
+/// A map cut into pieces of one superpixel and one label within a row, as they were counted.
+struct Segments {
+  std::vector<int> row_first;  ///< of each row, and the end
+  std::vector<int> begins;     ///< columns
+};
+
+/// Lets every pixel of the map vote. `label_row(row, cells, labels)` writes the labels of the given
+/// cells of a source row, or kNoVote; it is asked once per needed row. Returns the votes withheld.
 template <typename LabelRow>
-std::size_t vote(const SuperpixelMap& superpixels, const ImageSize& source,
-                 const LabelRow& label_row, Histogram* histogram) {
+std::size_t vote(const SuperpixelMap& superpixels, const ImageSize& source, LabelRow&& label_row,
+                 Histogram* histogram, Segments* segments) {
+  const ScoreKernels& kernels = scoreKernels();
   const cv::Mat& ids = superpixels.ids;
-  const std::vector<int> columns = cellsUnderCentres(ids.cols, source.width);
-  std::vector<int> labels(source.width);
+  const SampledCells sampled(ids.cols, source.width);
+  std::vector<int> cell_labels(sampled.cells.size()), labels(ids.cols), starts(ids.cols + 8);
   std::size_t withheld = 0;
   int labelled_row = -1;
+  segments->row_first.assign(1, 0);
+  segments->begins.clear();
   for (int y = 0; y < ids.rows; ++y) {
     const int row = cellUnderCentre(y, ids.rows, source.height);
-    if (row != labelled_row) label_row(row, labels.data());
+    if (row != labelled_row) {
+      label_row(row, sampled.cells, cell_labels.data());
+      for (int x = 0; x < ids.cols; ++x) labels[x] = cell_labels[sampled.place[x]];
+    }
     labelled_row = row;
     const int* id = ids.ptr<int>(y);
-    for (int x = 0; x < ids.cols; ++x) {
-      const int label = labels[columns[x]];
-      if (label == kNoVote) {
-        ++withheld;
+    const int count = kernels.segmentStarts(id, labels.data(), ids.cols, starts.data());
+    starts[count] = ids.cols;
+    for (int i = 0; i < count; ++i) {
+      const int x = starts[i], pixels = starts[i + 1] - x;
+      if (labels[x] == kNoVote) {
+        withheld += static_cast<std::size_t>(pixels);
       } else {
-        histogram->add(id[x], label);
+        histogram->add(id[x], labels[x], pixels);
       }
     }
+    segments->begins.insert(segments->begins.end(), starts.begin(), starts.begin() + count);
+    segments->row_first.push_back(static_cast<int>(segments->begins.size()));
   }
   return withheld;
 }
+
+/// An image with the value of its superpixel at each pixel.
+cv::Mat paint(const SuperpixelMap& superpixels, const Segments& segments,
+              const std::vector<float>& values) {
+  constexpr int kStep = 8;
+  cv::Mat image(superpixels.ids.size(), CV_32FC1);
+  for (int y = 0; y < image.rows; ++y) {
+    const int* id = superpixels.ids.ptr<int>(y);
+    float* out = image.ptr<float>(y);
+    // Whole steps may write beyond a segment: what comes after it is written after it.
+    const bool room = y + 1 < image.rows && image.cols >= kStep;
+    const int last = segments.row_first[y + 1] - 1;
+    for (int i = segments.row_first[y]; i <= last; ++i) {
+      const int begin = segments.begins[i], end = i < last ? segments.begins[i + 1] : image.cols;
+      const float value = values[id[begin]];
+      if (!room) {
+        std::fill(out + begin, out + end, value);
+        continue;
+      }
+      for (int x = begin; x < end; x += kStep) {
+        for (int k = 0; k < kStep; ++k) out[x + k] = value;
+      }
+    }
+  }
+  return image;
+}
+
+/// Labels of the cells of a row, as the argmax of their scores.
+class CellLabels {
+ public:
+  explicit CellLabels(const ScoreMap& scores) : scores_(scores) {}
+
+  void operator()(int row, const std::vector<int>& cells, int* labels) {
+    const auto count = static_cast<int>(cells.size());
+    const int classes = scores_.classCount();
+    if (const std::uint8_t* bytes = scores_.rankedRow<std::uint8_t>(row)) {
+      const std::uint8_t flip = scores_.lowestIsHighest() ? 0xff : 0;
+      kernels_.labelBytes(bytes, cells.data(), count, classes, flip, labels);
+    } else if (const std::uint16_t* words = scores_.rankedRow<std::uint16_t>(row)) {
+      const std::uint16_t flip = scores_.lowestIsHighest() ? 0xffff : 0;
+      kernels_.labelWords(words, cells.data(), count, classes, flip, labels);
+    } else if (const float* floats = scores_.floatRow(row)) {
+      kernels_.labelFloats(floats, cells.data(), count, classes, labels);
+    } else {
+      convert(row, cells);
+      kernels_.labelFloats(converted_.data(), in_order_.data(), count, classes, labels);
+    }
+  }
+
+ private:
+  void convert(int row, const std::vector<int>& cells) {
+    const auto classes = static_cast<std::size_t>(scores_.classCount());
+    converted_.resize(cells.size() * classes);
+    in_order_.resize(cells.size());
+    std::iota(in_order_.begin(), in_order_.end(), 0);
+    for (std::size_t i = 0; i < cells.size(); ++i) {
+      scores_.read(cells[i], row, &converted_[i * classes]);
+    }
+  }
+
+  const ScoreMap& scores_;
+  const ScoreKernels& kernels_ = scoreKernels();
+  std::vector<float> converted_;
+  std::vector<int> in_order_;
+};
 
 void fillUniform(int class_count, double* probabilities) {
   std::fill_n(probabilities, class_count, 1.0 / class_count);
@@ -92,17 +189,22 @@ ScoreMap::ScoreMap(const cv::Mat& scores, int class_count, const ScoreFormat& fo
     throw DataError("score image has " + std::to_string(scores.channels()) +
                     " channels, must have one per class: " + std::to_string(class_count));
   }
+  if (scores.depth() == CV_32F) return;
+  // Integers whose scores are two units in the last place of the largest score apart, or more, have
+  // different scores once rounded to single precision.
+  const double last = scores.depth() == CV_8U ? 255.0 : 65535.0;
+  const double largest =
+      std::max(std::abs(format.offset), std::abs(format.scale * last + format.offset));
+  ranked_ = largest < std::numeric_limits<float>::max() &&
+            std::abs(format.scale) > 2.0 * std::numeric_limits<float>::epsilon() * largest &&
+            std::abs(format.scale) > 2.0 * std::numeric_limits<float>::denorm_min();
 }
 
 bool ScoreMap::read(int column, int row, float* out) const {
   const int count = scores_.channels();
   const std::size_t first = static_cast<std::size_t>(column) * count;
-  bool finite = true;
   const auto convert = [&](const auto* cell) {
-    for (int c = 0; c < count; ++c) {
-      out[c] = static_cast<float>(format_.scale * cell[c] + format_.offset);
-      finite = finite && std::isfinite(out[c]);
-    }
+    for (int c = 0; c < count; ++c) out[c] = scoreOf(cell[c]);
   };
   switch (scores_.depth()) {
     case CV_8U:
@@ -111,36 +213,20 @@ bool ScoreMap::read(int column, int row, float* out) const {
     case CV_16U:
       convert(scores_.ptr<std::uint16_t>(row) + first);
       break;
-    default: {
-      const float* cell = scores_.ptr<float>(row) + first;
-      for (int c = 0; c < count; ++c) {
-        out[c] = cell[c];
-        finite = finite && std::isfinite(cell[c]);
-      }
-    }
+    default:
+      std::copy_n(scores_.ptr<float>(row) + first, count, out);
   }
-  return finite;
+  return std::all_of(out, out + count, [](float score) { return std::isfinite(score); });
 }
 
 ShareMap computeShare(const SuperpixelMap& superpixels, const ScoreMap& scores) {
   if (scores.empty()) throw DataError("score map is empty, must have at least one cell");
   const int class_count = scores.classCount();
-  std::vector<float> converted(static_cast<std::size_t>(scores.size().width) * class_count);
-  const LabelCells label_cells = labelCells();
-  const auto label_row = [&](int row, int* labels) {
-    const float* cells = scores.floatRow(row);
-    if (cells == nullptr) {
-      for (int x = 0; x < scores.size().width; ++x) {
-        scores.read(x, row, &converted[static_cast<std::size_t>(x) * class_count]);
-      }
-      cells = converted.data();
-    }
-    label_cells(cells, scores.size().width, class_count, labels);
-  };
-
   ShareMap result;
   Histogram histogram(superpixels.count, class_count);
-  result.nonfinite_cells = vote(superpixels, scores.size(), label_row, &histogram);
+  Segments segments;
+  result.nonfinite_cells =
+      vote(superpixels, scores.size(), CellLabels(scores), &histogram, &segments);
 
   result.superpixel.resize(superpixels.count);
   for (int k = 0; k < superpixels.count; ++k) {
@@ -153,12 +239,7 @@ ShareMap computeShare(const SuperpixelMap& superpixels, const ScoreMap& scores) 
             : static_cast<float>(static_cast<double>(most) / histogram.totals[k]);
   }
 
-  result.share.create(superpixels.ids.size(), CV_32FC1);
-  for (int y = 0; y < superpixels.ids.rows; ++y) {
-    const int* id = superpixels.ids.ptr<int>(y);
-    float* share = result.share.ptr<float>(y);
-    for (int x = 0; x < superpixels.ids.cols; ++x) share[x] = result.superpixel[id[x]];
-  }
+  result.share = paint(superpixels, segments, result.superpixel);
   return result;
 }
 
@@ -210,12 +291,13 @@ cv::Mat histogramProbabilities(const SuperpixelMap& superpixels, const cv::Mat& 
     throw DataError("label image is " + sizeText({labels.cols, labels.rows}) + " of OpenCV type " +
                     std::to_string(labels.type()) + ", must be non-empty 8UC1 (mono8)");
   }
-  const auto label_row = [&](int row, int* row_labels) {
+  const auto label_row = [&](int row, const std::vector<int>& cells, int* row_labels) {
     const std::uint8_t* in = labels.ptr<std::uint8_t>(row);
-    for (int x = 0; x < labels.cols; ++x) row_labels[x] = in[x] < class_count ? in[x] : kNoVote;
+    for (const int cell : cells) *row_labels++ = in[cell] < class_count ? in[cell] : kNoVote;
   };
   Histogram histogram(superpixels.count, class_count);
-  vote(superpixels, {labels.cols, labels.rows}, label_row, &histogram);
+  Segments segments;
+  vote(superpixels, {labels.cols, labels.rows}, label_row, &histogram, &segments);
 
   std::vector<float> probabilities(histogram.votes.size());
   for (int k = 0; k < superpixels.count; ++k) {

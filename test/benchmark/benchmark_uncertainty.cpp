@@ -101,6 +101,53 @@ void softmaxOpencv(benchmark::State& state) {
 }
 BENCHMARK(softmaxOpencv)->Name("softmax/dense_cv::exp")->Unit(benchmark::kMicrosecond);
 
+/// Superpixels as blocks of 16 x 16 pixels, of a map of 640x402.
+const SuperpixelMap& blocks() {
+  static const SuperpixelMap made = [] {
+    SuperpixelMap map;
+    map.ids.create(402, 640, CV_32SC1);
+    for (int y = 0; y < map.ids.rows; ++y) {
+      for (int x = 0; x < map.ids.cols; ++x) map.ids.at<int>(y, x) = y / 16 * 40 + x / 16;
+    }
+    map.count = 26 * 40;
+    return map;
+  }();
+  return made;
+}
+
+/// Scores of `type` whose labels come in patches, as a network gives them.
+cv::Mat patchyScores(int width, int height, int class_count, int depth) {
+  cv::RNG random(6);
+  cv::Mat image(height, width, CV_MAKETYPE(depth, class_count)),
+      patches(height / 20 + 1, width / 20 + 1, CV_8U);
+  random.fill(image.reshape(1), cv::RNG::UNIFORM, 0, 100);
+  random.fill(patches, cv::RNG::UNIFORM, 0, class_count);
+  for (int y = 0; y < height; ++y) {
+    for (int x = 0; x < width; ++x) {
+      const int at = x * class_count + patches.at<std::uint8_t>(y / 20, x / 20);
+      if (depth == CV_8U) image.ptr<std::uint8_t>(y)[at] = 200;
+      if (depth == CV_16U) image.ptr<std::uint16_t>(y)[at] = 200;
+      if (depth == CV_32F) image.ptr<float>(y)[at] = 200.0F;
+    }
+  }
+  return image;
+}
+
+/// Arguments: width of the scores, classes.
+void share(benchmark::State& state, int depth) {
+  const int width = static_cast<int>(state.range(0)), classes = static_cast<int>(state.range(1));
+  const ScoreMap map(patchyScores(width, width * 1208 / 1920, classes, depth), classes,
+                     {0.1, -12.0});
+  for (auto _ : state) benchmark::DoNotOptimize(computeShare(blocks(), map).share.data);
+}
+void shareArguments(benchmark::internal::Benchmark* row) {
+  row->Args({240, 12})->Args({640, 12})->Args({1920, 12})->Args({240, 150});
+  row->Unit(benchmark::kMicrosecond);
+}
+BENCHMARK_CAPTURE(share, float, CV_32F)->Name("share/float")->Apply(shareArguments);
+BENCHMARK_CAPTURE(share, u8, CV_8U)->Name("share/u8")->Apply(shareArguments);
+BENCHMARK_CAPTURE(share, u16, CV_16U)->Name("share/u16")->Apply(shareArguments);
+
 }  // namespace
 }  // namespace semantic_lidar_fusion
 

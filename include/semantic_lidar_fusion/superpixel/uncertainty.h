@@ -45,10 +45,24 @@ class ScoreMap {
   const float* floatRow(int row) const {
     return scores_.depth() == CV_32F ? scores_.ptr<float>(row) : nullptr;
   }
+  /// The values of a row's cells one after the other, where they are of type `Value` and rank as
+  /// their scores do, in single precision too: without equal scores of different values. Else null.
+  template <typename Value>
+  const Value* rankedRow(int row) const {
+    return ranked_ && scores_.depth() == cv::DataType<Value>::depth ? scores_.ptr<Value>(row)
+                                                                    : nullptr;
+  }
+  /// Whether ranked values have the higher score the lower they are.
+  bool lowestIsHighest() const { return format_.scale < 0.0; }
 
  private:
+  float scoreOf(int value) const {
+    return static_cast<float>(format_.scale * value + format_.offset);
+  }
+
   cv::Mat scores_;
   ScoreFormat format_;
+  bool ranked_ = false;  ///< integers that rankedRow() gives
 };
 
 /// Share of the most frequent label per superpixel.

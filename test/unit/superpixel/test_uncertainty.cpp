@@ -259,6 +259,20 @@ TEST(Share, EqualsTheDefinitionForScoreMapsOfAnySize) {
   }
 }
 
+/// What runs on this machine, plain kernels included.
+std::vector<const ScoreKernels*> allScoreKernels() {
+  return {&kPlainScoreKernels, &scoreKernels()};
+}
+
+/// Every cell of a row, but for each fifth, in disorder: the kernels take any list.
+std::vector<int> someCells(int cell_count) {
+  std::vector<int> cells;
+  for (int i = cell_count - 1; i >= 0; --i) {
+    if (i % 5 != 2) cells.push_back(i);
+  }
+  return cells;
+}
+
 TEST(LabelCells, AreTheFirstHighestOfFiniteScores) {
   std::mt19937 random(21);
   const float specials[] = {kNan, kInfinity, -kInfinity, -0.0F, 3e38F, -3e38F};
@@ -268,17 +282,116 @@ TEST(LabelCells, AreTheFirstHighestOfFiniteScores) {
     // Few levels, so that ties occur in every lane.
     for (float& score : scores) score = static_cast<float>(static_cast<int>(random() % 5) - 3);
     for (int i = 0; i < 60; ++i) scores[random() % scores.size()] = specials[random() % 6];
-    std::vector<int> plain(cell_count), fastest(cell_count);
-    labelCellsPlain(scores.data(), cell_count, class_count, plain.data());
-    labelCells()(scores.data(), cell_count, class_count, fastest.data());
-    for (int i = 0; i < cell_count; ++i) {
-      const float* cell = &scores[static_cast<std::size_t>(i) * class_count];
-      int expected = static_cast<int>(std::max_element(cell, cell + class_count) - cell);
-      for (int c = 0; c < class_count; ++c) {
-        if (!std::isfinite(cell[c])) expected = kNoVote;
+    const std::vector<int> cells = someCells(cell_count);
+    for (const ScoreKernels* kernels : allScoreKernels()) {
+      std::vector<int> labels(cells.size());
+      kernels->labelFloats(scores.data(), cells.data(), static_cast<int>(cells.size()), class_count,
+                           labels.data());
+      for (std::size_t i = 0; i < cells.size(); ++i) {
+        const float* cell = &scores[static_cast<std::size_t>(cells[i]) * class_count];
+        int expected = static_cast<int>(std::max_element(cell, cell + class_count) - cell);
+        for (int c = 0; c < class_count; ++c) {
+          if (!std::isfinite(cell[c])) expected = kNoVote;
+        }
+        ASSERT_EQ(labels[i], expected)
+            << kernels->name << ", cell " << cells[i] << ", classes " << class_count;
       }
-      ASSERT_EQ(plain[i], expected) << "cell " << i << ", classes " << class_count;
-      ASSERT_EQ(fastest[i], expected) << "cell " << i << ", classes " << class_count;
+    }
+  }
+}
+
+template <typename Score, typename Label>
+void checkIntegerLabels(Score levels, const Label& label) {
+  std::mt19937 random(22);
+  for (int class_count = 1; class_count <= 70; ++class_count) {
+    const int cell_count = 120;
+    std::vector<Score> scores(static_cast<std::size_t>(cell_count) * class_count);
+    const Score base = static_cast<Score>(random());
+    for (Score& score : scores) score = static_cast<Score>(base + random() % levels);
+    const std::vector<int> cells = someCells(cell_count);
+    for (const ScoreKernels* kernels : allScoreKernels()) {
+      for (const bool lowest : {false, true}) {
+        std::vector<int> labels(cells.size());
+        label(*kernels, scores.data(), cells, class_count,
+              static_cast<Score>(lowest ? ~Score{0} : Score{0}), labels.data());
+        for (std::size_t i = 0; i < cells.size(); ++i) {
+          const Score* cell = &scores[static_cast<std::size_t>(cells[i]) * class_count];
+          const Score* end = cell + class_count;
+          ASSERT_EQ(labels[i],
+                    (lowest ? std::min_element(cell, end) : std::max_element(cell, end)) - cell)
+              << kernels->name << ", cell " << cells[i] << ", classes " << class_count;
+        }
+      }
+    }
+  }
+}
+
+TEST(LabelCells, OfIntegersAreTheFirstHighestOrLowest) {
+  const auto bytes = [](const ScoreKernels& kernels, const std::uint8_t* scores,
+                        const std::vector<int>& cells, int class_count, std::uint8_t flip,
+                        int* labels) {
+    kernels.labelBytes(scores, cells.data(), static_cast<int>(cells.size()), class_count, flip,
+                       labels);
+  };
+  const auto words = [](const ScoreKernels& kernels, const std::uint16_t* scores,
+                        const std::vector<int>& cells, int class_count, std::uint16_t flip,
+                        int* labels) {
+    kernels.labelWords(scores, cells.data(), static_cast<int>(cells.size()), class_count, flip,
+                       labels);
+  };
+  // Few levels give ties, many give the whole range.
+  checkIntegerLabels<std::uint8_t>(3, bytes);
+  checkIntegerLabels<std::uint8_t>(255, bytes);
+  checkIntegerLabels<std::uint16_t>(3, words);
+  checkIntegerLabels<std::uint16_t>(65535, words);
+}
+
+TEST(SegmentStarts, AreWhereAnIdOrALabelChanges) {
+  std::mt19937 random(23);
+  for (int count = 1; count < 70; ++count) {
+    std::vector<int> ids(count), labels(count), expected;
+    for (int x = 0; x < count; ++x) {
+      ids[x] = x > 0 && random() % 6 != 0 ? ids[x - 1] : static_cast<int>(random() % 1000);
+      labels[x] = x > 0 && random() % 9 != 0 ? labels[x - 1] : static_cast<int>(random() % 4) - 1;
+      if (x == 0 || ids[x] != ids[x - 1] || labels[x] != labels[x - 1]) expected.push_back(x);
+    }
+    for (const ScoreKernels* kernels : allScoreKernels()) {
+      std::vector<int> starts(count + 8);
+      starts.resize(kernels->segmentStarts(ids.data(), labels.data(), count, starts.data()));
+      ASSERT_EQ(starts, expected) << kernels->name << ", " << count;
+    }
+  }
+}
+
+/// The scores as the format makes them, in single precision.
+cv::Mat convertedScores(const cv::Mat& values, const ScoreFormat& format) {
+  cv::Mat wide, scores(values.size(), CV_32FC(values.channels()));
+  values.convertTo(wide, CV_64F);
+  for (int y = 0; y < values.rows; ++y) {
+    for (int i = 0; i < values.cols * values.channels(); ++i) {
+      scores.ptr<float>(y)[i] =
+          static_cast<float>(format.scale * wide.ptr<double>(y)[i] + format.offset);
+    }
+  }
+  return scores;
+}
+
+TEST(Share, OfIntegersIsThatOfTheScoresTheyStandFor) {
+  const SuperpixelMap map = blockMap(50, 30, 7);
+  // The last two lose differences to single precision, or all range of it.
+  const ScoreFormat formats[] = {{0.1, -3.0}, {-0.25, 2.0}, {0.0, 1.0}, {1e-3, 1e6}, {1e34, 0.0}};
+  for (const int depth : {CV_8U, CV_16U}) {
+    for (const int class_count : {3, 12, 19}) {
+      cv::Mat values(40, 90, CV_MAKETYPE(depth, class_count));
+      cv::RNG(class_count)
+          .fill(values.reshape(1), cv::RNG::UNIFORM, 0, depth == CV_8U ? 256 : 65536);
+      for (const ScoreFormat& format : formats) {
+        const ShareMap share = computeShare(map, ScoreMap(values, class_count, format));
+        const ShareMap expected =
+            computeShare(map, ScoreMap(convertedScores(values, format), class_count, {}));
+        EXPECT_EQ(share.superpixel, expected.superpixel) << format.scale << " " << class_count;
+        EXPECT_EQ(share.nonfinite_cells, expected.nonfinite_cells);
+      }
     }
   }
 }
