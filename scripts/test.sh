@@ -103,5 +103,6 @@ export SLF_TEST_WORKSPACE=$workspace SLF_JOBS=$jobs
 rm -rf test_results ros_home Testing
 # rospack complains on stderr if the parent of its cache is absent.
 cut -f1 expected_tests.txt | while read -r name; do mkdir -p "ros_home/$name"; done
-ctest --output-on-failure -j"$jobs" ${filter:+-R "$filter"} </dev/null || true
+# One more than there are processors: half of the tests wait for nodes.
+ctest --output-on-failure -j$((jobs + 1)) ${filter:+-R "$filter"} </dev/null || true
 exec /usr/bin/python3 "$source_dir/test/gate/gate.py" "$build_dir" ${filter:+--filter "$filter"}
