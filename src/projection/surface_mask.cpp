@@ -2,10 +2,13 @@
 #include "semantic_lidar_fusion/projection/surface_mask.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <numeric>
+#include <optional>
 
+#include "mask_kernels.h"
 #include "semantic_lidar_fusion/projection/rolling_shutter.h"
 
 namespace semantic_lidar_fusion {
@@ -19,69 +22,128 @@ constexpr float kEdgeReach = 0.75f;
 /// The same, up and down, for a return that continues on neither side: often a level surface seen
 /// edge-on (a roof), of which a tall mask would be wrong; and to all sides for one on no surface.
 constexpr float kLoneReach = 0.5f;
-/// px around each mask, so that twisted neighbours leave no cracks.
-constexpr float kSlack_px = 0.5f;
 
 /// The points in the image, tile by tile, with the farthest of each tile: most surfaces have
 /// nothing behind them.
 class Tiles {
  public:
-  Tiles(const ProjectedPoints& points, const ImageSize& size, float tile_px)
-      : per_px_(1.0f / tile_px),
-        columns_(1 + static_cast<int>(static_cast<float>(size.width) * per_px_)),
-        rows_(1 + static_cast<int>(static_cast<float>(size.height) * per_px_)),
-        begin_(static_cast<std::size_t>(columns_) * static_cast<std::size_t>(rows_) + 1, 0),
-        far_(begin_.size(), 0.0f) {
+  Tiles(const ProjectedPoints& points, const ImageSize& size, float tile_px,
+        const OcclusionConfig& config) {
+    tiled_.per_px = 1.0f / tile_px;
+    tiled_.columns = 1 + static_cast<int>(static_cast<float>(size.width) * tiled_.per_px);
+    tiled_.rows = 1 + static_cast<int>(static_cast<float>(size.height) * tiled_.per_px);
+    tiled_.margin_m = static_cast<float>(config.depth_margin_m);
+    tiled_.margin_ratio = static_cast<float>(config.depth_margin_ratio);
+    sort(points, size);
+    spreadFarthest();
+    tiled_.begin = begin_.data();
+    tiled_.far = far_.data();
+    tiled_.far_of_four = far_of_four_.data();
+    tiled_.u = u_.data();
+    tiled_.v = v_.data();
+    tiled_.distance = distance_.data();
+    tiled_.place = place_.data();
+  }
+  Tiles(const Tiles&) = delete;
+  Tiles& operator=(const Tiles&) = delete;
+
+  const TiledPoints& points() const { return tiled_; }
+
+ private:
+  void sort(const ProjectedPoints& points, const ImageSize& size) {
     constexpr std::uint32_t kOutside = 0xFFFFFFFFu;
+    constexpr std::size_t kRoom = 8;  // wide kernels read whole registers
+    begin_.assign(static_cast<std::size_t>(tiled_.columns) * tiled_.rows + 1, 0);
+    far_.assign(begin_.size(), 0.0f);
     std::vector<std::uint32_t> tile(points.size(), kOutside);
     for (std::size_t i = 0; i < points.size(); ++i) {
       if (!inImage(points.u[i], points.v[i], size)) continue;
-      tile[i] = static_cast<std::uint32_t>(row(points.v[i]) * columns_ + column(points.u[i]));
+      tile[i] = static_cast<std::uint32_t>(at(points.v[i], tiled_.rows) * tiled_.columns +
+                                           at(points.u[i], tiled_.columns));
       ++begin_[tile[i] + 1];
       far_[tile[i]] = std::max(far_[tile[i]], points.distance[i]);
     }
     std::partial_sum(begin_.begin(), begin_.end(), begin_.begin());
     std::vector<std::uint32_t> next(begin_.begin(), begin_.end() - 1);
-    points_.resize(begin_.back());
+    for (std::vector<float>* values : {&u_, &v_, &distance_}) values->resize(begin_.back() + kRoom);
+    place_.resize(begin_.back());
     for (std::size_t i = 0; i < points.size(); ++i) {
       if (tile[i] == kOutside) continue;
-      points_[next[tile[i]]++] = {points.u[i], points.v[i], points.distance[i],
-                                  static_cast<std::uint32_t>(i)};
+      const std::uint32_t to = next[tile[i]]++;
+      u_[to] = points.u[i];
+      v_[to] = points.v[i];
+      distance_[to] = points.distance[i];
+      place_[to] = static_cast<std::uint32_t>(i);
     }
   }
 
-  struct Point {
-    float u, v, distance;
-    std::uint32_t place;  ///< in the projected points
-  };
-
-  /// Calls visit(Point) for the points of all tiles that a box touches and in which something is
-  /// farther than `nearest`.
-  template <typename Visit>
-  void visit(float u_low, float u_high, float v_low, float v_high, float nearest,
-             const Visit& visit) const {
-    const int x_begin = column(u_low), x_end = column(u_high);
-    for (int y = row(v_low), y_end = row(v_high); y <= y_end; ++y) {
-      for (int x = x_begin; x <= x_end; ++x) {
-        const auto tile = static_cast<std::size_t>(y * columns_ + x);
-        if (!(far_[tile] > nearest)) continue;
-        for (std::uint32_t k = begin_[tile]; k < begin_[tile + 1]; ++k) visit(points_[k]);
+  void spreadFarthest() {
+    const int columns = tiled_.columns, rows = tiled_.rows;
+    far_of_four_.resize(far_.size());
+    for (int y = 0; y < rows; ++y) {
+      const float* here = &far_[static_cast<std::size_t>(y) * columns];
+      const float* below = y + 1 < rows ? here + columns : here;
+      float* out = &far_of_four_[static_cast<std::size_t>(y) * columns];
+      for (int x = 0; x < columns; ++x) {
+        const int right = std::min(x + 1, columns - 1);
+        out[x] = std::max(std::max(here[x], here[right]), std::max(below[x], below[right]));
       }
     }
   }
 
- private:
-  int column(float u) const { return clamped((u + 0.5f) * per_px_, columns_); }
-  int row(float v) const { return clamped((v + 0.5f) * per_px_, rows_); }
-  static int clamped(float at, int count) {
-    return static_cast<int>(std::max(0.0f, std::min(at, static_cast<float>(count - 1))));
+  int at(float px, int count) const {
+    const float tile = (px + 0.5f) * tiled_.per_px;
+    return static_cast<int>(std::max(0.0f, std::min(tile, static_cast<float>(count - 1))));
   }
 
-  float per_px_;
-  int columns_, rows_;
-  std::vector<std::uint32_t> begin_;  ///< into points_, one more than tiles
-  std::vector<float> far_;            ///< m
-  std::vector<Point> points_;
+  TiledPoints tiled_;
+  std::vector<std::uint32_t> begin_, place_;
+  std::vector<float> far_, far_of_four_;  ///< m
+  std::vector<float> u_, v_, distance_;
+};
+
+/// Where the camera sees points that are not among the projected ones.
+class TargetProjector {
+ public:
+  explicit TargetProjector(const MaskInput& input) : input_(input) {
+    const CameraModel& camera = input.camera;
+    const std::array<double, 4>* k = camera.lens().kannalaBrandt();
+    const bool rolls = input.motion != nullptr && camera.rollingShutter();
+    if (k == nullptr || rolls) return;
+    exact_.emplace();
+    Eigen::Map<Eigen::Matrix<double, 3, 4, Eigen::RowMajor>> matrix(exact_->matrix);
+    const Transform& T = input.T_camera_lidar;
+    matrix.leftCols<3>() = camera.R_raw_camera() * T.linear();
+    matrix.col(3) = camera.R_raw_camera() * (T.translation() - camera.opticalCentre());
+    exact_->focal_x = camera.fx();
+    exact_->focal_y = camera.fy();
+    exact_->skew = camera.skew();
+    exact_->centre_x = camera.cx();
+    exact_->centre_y = camera.cy();
+    std::copy(k->begin(), k->end(), exact_->k);
+    exact_->theta_end = camera.maxThetaRad();
+  }
+
+  void project(int count, ArmTargets* targets) const {
+    if (exact_) {
+      maskKernels().projectTargets(*exact_, count, targets);
+      return;
+    }
+    for (int i = 0; i < count; ++i) {
+      const Eigen::Vector3d p(targets->x[i], targets->y[i], targets->z[i]);
+      const auto seen = seePoint(input_.camera, input_.motion, input_.T_camera_lidar * p);
+      targets->u[i] = std::numeric_limits<float>::quiet_NaN();
+      if (!seen) continue;
+      const double distance = (seen->p_camera - input_.camera.opticalCentre()).norm();
+      targets->u[i] = static_cast<float>(seen->pixel.x());
+      targets->v[i] = static_cast<float>(seen->pixel.y());
+      targets->nearness[i] = static_cast<float>(1.0 / std::max(distance, kLeastMaskDistance));
+    }
+  }
+
+ private:
+  const MaskInput& input_;
+  std::optional<ExactLens> exact_;  ///< empty: the lens has no kernel, or rows of their own time
 };
 
 class SurfaceMasks {
@@ -89,24 +151,30 @@ class SurfaceMasks {
   explicit SurfaceMasks(const MaskInput& input)
       : cloud_(input.cloud),
         points_(input.points),
-        T_camera_lidar_(input.T_camera_lidar),
         camera_(input.camera),
-        motion_(input.motion),
         grid_(input.grid),
+        projector_(input),
         margin_m_(static_cast<float>(input.config.depth_margin_m)),
         margin_ratio_(static_cast<float>(input.config.depth_margin_ratio)),
         tiles_(points_, camera_.imageSize(),
                std::max(4.0f,
-                        static_cast<float>(0.5 * camera_.axialFocalY() * grid_.vertical_step_rad))),
-        slot_(cloud_.size(), -1) {
+                        static_cast<float>(0.5 * camera_.axialFocalY() * grid_.vertical_step_rad)),
+               input.config),
+        slot_(cloud_.size(), -1),
+        nearness_(points_.size()) {
     for (std::size_t i = 0; i < points_.size(); ++i) {
       slot_[points_.index[i]] = static_cast<std::int32_t>(i);
+      nearness_[i] = 1.0f / std::max(points_.distance[i], 1e-3f);
     }
   }
 
   std::vector<std::uint8_t> visible() {
     visible_.assign(points_.size(), 1);
-    for (std::size_t i = 0; i < points_.size(); ++i) cast(i);
+    for (std::size_t i = 0; i < points_.size(); ++i) {
+      addCaster(i);
+      if (casters_ == kMaskBlock) castAll();
+    }
+    castAll();
     for (std::size_t i = 0; i < points_.size(); ++i) {
       if (!inImage(points_.u[i], points_.v[i], camera_.imageSize())) visible_[i] = 0;
     }
@@ -114,48 +182,89 @@ class SurfaceMasks {
   }
 
  private:
-  struct Sample {
-    Eigen::Vector2f pixel;
-    float nearness = 0;  ///< 1 / distance to the camera
+  /// An arm of the block whose target is still to be projected: of the way there, `part` is taken.
+  struct OpenArm {
+    int caster;
+    MaskSide side;
+    float part;
   };
-  /// End of a mask in one direction.
-  struct Arm {
-    Eigen::Vector2f offset = Eigen::Vector2f::Zero();  ///< px, from the point
-    float nearness = 0;
-  };
-
-  Sample sampleOf(std::size_t i) const {
-    return {{points_.u[i], points_.v[i]}, 1.0f / std::max(points_.distance[i], 1e-3f)};
-  }
 
   Eigen::Vector3f point(std::int32_t i) const {
     const auto k = static_cast<std::size_t>(i);
     return {cloud_.x[k], cloud_.y[k], cloud_.z[k]};
   }
 
-  /// An arm to a point in the lidar's frame, of which `part` is taken; none if it has no pixel.
-  /// Inverse distance is linear in the image on a plane.
-  Arm armToPoint(const Sample& own, const Eigen::Vector3f& p_lidar, float part) const {
-    const auto seen = seePoint(camera_, motion_, T_camera_lidar_ * p_lidar.cast<double>());
-    if (!seen) return {Eigen::Vector2f::Zero(), own.nearness};
-    const double distance = std::max((seen->p_camera - camera_.opticalCentre()).norm(), 1e-3);
-    const float nearness = static_cast<float>(1.0 / distance);
-    return {part * (seen->pixel.cast<float>() - own.pixel),
-            own.nearness + part * (nearness - own.nearness)};
+  void addCaster(std::size_t i) {
+    constexpr std::int32_t kNone = BeamGrid::kNoLink;
+    const std::uint32_t index = points_.index[i];
+    if (grid_.ring[index] == kNoRing) return;
+    const BeamGrid::Links& links = grid_.links[index];
+    const auto self = static_cast<std::int32_t>(index);
+    block_.u[casters_] = points_.u[i];
+    block_.v[casters_] = points_.v[i];
+    block_.nearness[casters_] = nearness_[i];
+    const bool whole =
+        links.left != kNone && links.right != kNone && links.up != kNone && links.down != kNone;
+    if (whole) {
+      addLink(links.left, kMaskLeft);
+      addLink(links.right, kMaskRight);
+      addLink(links.up, kMaskUp);
+      addLink(links.down, kMaskDown);
+    } else {
+      addArms(self, links, grid_.rings[grid_.ring[index]]);
+    }
+    ++casters_;
+  }
+
+  /// The arms of a return whose surface ends on some side.
+  void addArms(std::int32_t self, const BeamGrid::Links& links, const BeamGrid::Ring& ring) {
+    constexpr std::int32_t kNone = BeamGrid::kNoLink;
+    const bool lone = links.up == kNone && links.down == kNone;
+    const bool alone = lone && links.left == kNone && links.right == kNone;
+    const float wide =
+        2.0f * (alone ? kLoneReach : kEdgeReach) * static_cast<float>(ring.half_azimuth_rad);
+    const float tall = 2.0f * (lone ? kLoneReach : kEdgeReach);
+    const float high = tall * static_cast<float>(ring.half_up_rad);
+    const float low = tall * static_cast<float>(ring.half_down_rad);
+    const auto add = [&](std::int32_t link, std::int32_t opposite, MaskSide side, float azimuth_rad,
+                         float elevation_rad) {
+      if (link != kNone) {
+        addLink(link, side);
+      } else {
+        openArm(edge(self, opposite, azimuth_rad, elevation_rad), side, 1.0f);
+      }
+    };
+    add(links.left, links.right, kMaskLeft, wide, 0.0f);
+    add(links.right, links.left, kMaskRight, -wide, 0.0f);
+    add(links.up, links.down, kMaskUp, 0.0f, high);
+    add(links.down, links.up, kMaskDown, 0.0f, -low);
   }
 
   /// Half-way to a neighbour on the same surface.
-  Arm armToLink(const Sample& own, std::int32_t link) const {
+  void addLink(std::int32_t link, MaskSide side) {
     const std::int32_t slot = slot_[static_cast<std::size_t>(link)];
-    if (slot < 0) return armToPoint(own, point(link), 0.5f);
-    const Sample other = sampleOf(static_cast<std::size_t>(slot));
-    return {0.5f * (other.pixel - own.pixel), 0.5f * (other.nearness + own.nearness)};
+    if (slot < 0) {
+      openArm(point(link), side, 0.5f);
+      return;
+    }
+    const auto other = static_cast<std::size_t>(slot);
+    block_.arm_u[side][casters_] = 0.5f * (points_.u[other] - block_.u[casters_]);
+    block_.arm_v[side][casters_] = 0.5f * (points_.v[other] - block_.v[casters_]);
+    block_.arm_nearness[side][casters_] = 0.5f * (nearness_[other] + block_.nearness[casters_]);
   }
 
-  /// To where the surface may end, turned from the beam by the given angles (one of them is 0). It
+  void openArm(const Eigen::Vector3f& target, MaskSide side, float part) {
+    targets_.x[open_] = target.x();
+    targets_.y[open_] = target.y();
+    targets_.z[open_] = target.z();
+    arms_[open_] = {casters_, side, part};
+    ++open_;
+  }
+
+  /// Where the surface may end, turned from the beam by the given angles (one of them is 0). It
   /// goes on straight from the neighbour `opposite`, or else at the same range.
-  Arm armToEdge(const Sample& own, std::int32_t self, std::int32_t opposite, float azimuth_rad,
-                float elevation_rad) const {
+  Eigen::Vector3f edge(std::int32_t self, std::int32_t opposite, float azimuth_rad,
+                       float elevation_rad) const {
     const Eigen::Vector3f p = point(self);
     const float range = p.norm(), flat = std::max(p.head<2>().norm(), 1e-6f);
     float scale = 1.0f;  // of the range
@@ -178,89 +287,55 @@ class SurfaceMasks {
     const float cos_e = 1.0f - 0.5f * elevation_rad * elevation_rad;
     const Eigen::Vector3f turned(cos_a * p.x() - a * p.y(), cos_a * p.y() + a * p.x(), p.z());
     const Eigen::Vector3f up(-p.z() * p.x() / flat, -p.z() * p.y() / flat, flat);
-    return armToPoint(own, scale * (cos_e * turned + e * up), 1.0f);
+    return scale * (cos_e * turned + e * up);
   }
 
-  void cast(std::size_t i) {
-    constexpr std::int32_t kNone = BeamGrid::kNoLink;
-    const std::uint32_t index = points_.index[i];
-    if (grid_.ring[index] == kNoRing) return;
-    const BeamGrid::Ring& ring = grid_.rings[grid_.ring[index]];
-    const BeamGrid::Links& links = grid_.links[index];
-    const auto self = static_cast<std::int32_t>(index);
-    const bool lone = links.up == kNone && links.down == kNone;
-    const bool alone = lone && links.left == kNone && links.right == kNone;
-    const float wide =
-        2.0f * (alone ? kLoneReach : kEdgeReach) * static_cast<float>(ring.half_azimuth_rad);
-    const float tall = 2.0f * (lone ? kLoneReach : kEdgeReach);
-    const float high = tall * static_cast<float>(ring.half_up_rad);
-    const float low = tall * static_cast<float>(ring.half_down_rad);
-    const Sample own = sampleOf(i);
-    const Arm left = links.left != kNone ? armToLink(own, links.left)
-                                         : armToEdge(own, self, links.right, wide, 0.0f);
-    const Arm right = links.right != kNone ? armToLink(own, links.right)
-                                           : armToEdge(own, self, links.left, -wide, 0.0f);
-    const Arm up =
-        links.up != kNone ? armToLink(own, links.up) : armToEdge(own, self, links.down, 0.0f, high);
-    const Arm down = links.down != kNone ? armToLink(own, links.down)
-                                         : armToEdge(own, self, links.up, 0.0f, -low);
-    castHalf(own, left, right, up);
-    castHalf(own, left, right, down);
+  /// Ends the open arms at what the camera sees of their targets, at the point itself where that is
+  /// nothing. Inverse distance is linear in the image on a plane.
+  void closeArms() {
+    projector_.project(open_, &targets_);
+    for (int k = 0; k < open_; ++k) {
+      const OpenArm& arm = arms_[k];
+      const float own = block_.nearness[arm.caster];
+      float u = 0.0f, v = 0.0f, nearness = own;
+      if (!std::isnan(targets_.u[k])) {
+        u = arm.part * (targets_.u[k] - block_.u[arm.caster]);
+        v = arm.part * (targets_.v[k] - block_.v[arm.caster]);
+        nearness = own + arm.part * (targets_.nearness[k] - own);
+      }
+      block_.arm_u[arm.side][arm.caster] = u;
+      block_.arm_v[arm.side][arm.caster] = v;
+      block_.arm_nearness[arm.side][arm.caster] = nearness;
+    }
+    open_ = 0;
   }
 
-  /// Hides what lies behind the parallelogram from the left to the right arm's end, swept along the
-  /// arm `along`.
-  void castHalf(const Sample& own, const Arm& left, const Arm& right, const Arm& along) {
-    const Eigen::Vector2f across = 0.5f * (right.offset - left.offset);
-    const Eigen::Vector2f centre = own.pixel + 0.5f * (right.offset + left.offset);
-    const float s_gain = 0.5f * (right.nearness - left.nearness);
-    const float t_gain = along.nearness - own.nearness;
-    const float least = std::min(own.nearness, along.nearness) - std::abs(s_gain);
-    const float most = std::max(own.nearness, along.nearness) + std::abs(s_gain);
-    const float nearest = hiddenBeyond(most);
-
-    // Pixel = centre + s * across + t * along, s in -1..1, t in 0..1
-    const float det = across.x() * along.offset.y() - across.y() * along.offset.x();
-    if (!(std::abs(det) >= 1e-3f * (across.norm() + along.offset.norm()))) return;  // edge-on
-    const float s_x = along.offset.y() / det, s_y = -along.offset.x() / det;
-    const float t_x = -across.y() / det, t_y = across.x() / det;
-    const float s_most = 1.0f + kSlack_px * (std::abs(s_x) + std::abs(s_y));
-    const float t_slack = kSlack_px * (std::abs(t_x) + std::abs(t_y));
-
-    const float wide = std::abs(across.x()) + 2.0f * kSlack_px;
-    const float high = std::abs(across.y()) + 2.0f * kSlack_px;
-    tiles_.visit(centre.x() - wide + std::min(0.0f, along.offset.x()),
-                 centre.x() + wide + std::max(0.0f, along.offset.x()),
-                 centre.y() - high + std::min(0.0f, along.offset.y()),
-                 centre.y() + high + std::max(0.0f, along.offset.y()), nearest,
-                 [&](const Tiles::Point& point) {
-                   if (!(point.distance > nearest)) return;
-                   const float du = point.u - centre.x(), dv = point.v - centre.y();
-                   const float s = s_x * du + s_y * dv, t = t_x * du + t_y * dv;
-                   if (std::abs(s) > s_most || t < -t_slack || t > 1.0f + t_slack) return;
-                   const float nearness =
-                       std::min(most, std::max(least, own.nearness + s_gain * s + t_gain * t));
-                   if (point.distance > hiddenBeyond(nearness)) visible_[point.place] = 0;
-                 });
-  }
-
-  /// Distance from which a mask of 1 / distance `nearness` hides; never if that is not positive.
-  float hiddenBeyond(float nearness) const {
-    if (!(nearness > 0.0f)) return std::numeric_limits<float>::max();
-    const float near = 1.0f / nearness;
-    return near + std::max(margin_m_, margin_ratio_ * near);
+  void castAll() {
+    closeArms();
+    const MaskKernels& kernels = maskKernels();
+    const int count = kernels.castHalves(block_, casters_, tiles_.points(), halves_);
+    for (int k = 0; k < count; ++k) kernels.hide(halves_[k], tiles_.points(), visible_.data());
+    casters_ = 0;
   }
 
   const Cloud& cloud_;
   const ProjectedPoints& points_;
-  const Transform& T_camera_lidar_;
   const CameraModel& camera_;
-  const Twist* motion_;
   const BeamGrid& grid_;
+  TargetProjector projector_;
   float margin_m_, margin_ratio_;
   Tiles tiles_;
   std::vector<std::int32_t> slot_;  ///< by cloud index: place in `points_`, -1 = none
+  std::vector<float> nearness_;     ///< 1 / distance to the camera, of `points_`
   std::vector<std::uint8_t> visible_;
+
+  // The block at hand.
+  MaskCasters block_;
+  int casters_ = 0;
+  ArmTargets targets_;
+  OpenArm arms_[kMaskSides * kMaskBlock];
+  int open_ = 0;
+  HalfMask halves_[2 * kMaskBlock];
 };
 
 }  // namespace
