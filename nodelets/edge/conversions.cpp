@@ -14,7 +14,9 @@
 #include <opencv2/imgproc.hpp>
 
 #include "edge/jpeg_decoder.h"
+#include "semantic_lidar_fusion/common/cloud_bytes.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/motion/pose_buffer.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -121,61 +123,28 @@ std::uint32_t sizeOf(std::uint8_t datatype) {
   }
 }
 
-/// Appends a field at its natural alignment and returns its offset.
-std::uint32_t addField(const std::string& name, std::uint8_t datatype,
-                       sensor_msgs::PointCloud2* message) {
-  const std::uint32_t size = sizeOf(datatype);
-  PointField field;
-  field.name = name;
-  field.datatype = datatype;
-  field.count = 1;
-  field.offset = (message->point_step + size - 1) / size * size;
-  message->point_step = field.offset + size;
-  message->fields.push_back(field);
-  return field.offset;
-}
-
-void allocatePoints(std::size_t points, sensor_msgs::PointCloud2* message) {
-  message->point_step = (message->point_step + 3) / 4 * 4;
-  const std::uint64_t bytes = static_cast<std::uint64_t>(points) * message->point_step;
-  if (bytes > std::numeric_limits<std::uint32_t>::max()) {
-    throw DataError("cloud of " + std::to_string(points) + " points does not fit a PointCloud2");
+/// A message of the header's stamp and frame with these points, height 1.
+sensor_msgs::PointCloud2Ptr cloudMessage(StampNs stamp, const std::string& frame,
+                                         std::size_t points, CloudBytes&& bytes) {
+  auto message = boost::make_shared<sensor_msgs::PointCloud2>();
+  message->header.stamp = rosTime(stamp);
+  message->header.frame_id = frame;
+  for (const CloudField& source : bytes.fields) {
+    PointField field;
+    field.name = source.name;
+    field.datatype = static_cast<std::uint8_t>(source.type);
+    field.offset = source.offset;
+    field.count = 1;
+    message->fields.push_back(field);
   }
   message->height = 1;
   message->width = static_cast<std::uint32_t>(points);
-  message->row_step = static_cast<std::uint32_t>(bytes);
+  message->point_step = bytes.point_step;
+  message->row_step = static_cast<std::uint32_t>(bytes.data.size());
   message->is_bigendian = kHostIsBigEndian;
   message->is_dense = true;
-  message->data.resize(bytes);
-}
-
-template <typename T>
-void put(const T& value, std::uint32_t offset, std::uint8_t* point) {
-  std::memcpy(point + offset, &value, sizeof(T));
-}
-
-struct CommonOffsets {
-  std::uint32_t x, y, z, intensity, ring, dt;
-};
-
-CommonOffsets addCommonFields(sensor_msgs::PointCloud2* message) {
-  CommonOffsets at{};
-  at.x = addField("x", PointField::FLOAT32, message);
-  at.y = addField("y", PointField::FLOAT32, message);
-  at.z = addField("z", PointField::FLOAT32, message);
-  at.intensity = addField("intensity", PointField::FLOAT32, message);
-  at.ring = addField("ring", PointField::UINT16, message);
-  at.dt = addField("dt", PointField::FLOAT32, message);
-  return at;
-}
-
-void putCommon(const Cloud& cloud, std::size_t i, const CommonOffsets& at, std::uint8_t* point) {
-  put(cloud.x[i], at.x, point);
-  put(cloud.y[i], at.y, point);
-  put(cloud.z[i], at.z, point);
-  put(cloud.intensity[i], at.intensity, point);
-  put(cloud.ring[i], at.ring, point);
-  put(cloud.dt[i], at.dt, point);
+  message->data = std::move(bytes.data);
+  return message;
 }
 
 /// The field, checked to have the wanted type and to lie within the point; null if absent.
@@ -226,22 +195,6 @@ void checkLayout(const sensor_msgs::PointCloud2& message) {
     fail("data has " + std::to_string(message.data.size()) +
          " bytes; height * row_step = " + std::to_string(total) + " are wanted");
   }
-}
-
-Transform checkedTransform(const Eigen::Vector3d& translation, double w, double x, double y,
-                           double z) {
-  const Eigen::Quaterniond rotation(w, x, y, z);
-  if (!translation.allFinite() || !rotation.coeffs().allFinite()) {
-    throw DataError("transform has a number that is not finite");
-  }
-  if (std::abs(rotation.norm() - 1.0) > 1e-2) {
-    throw DataError("transform has a quaternion of norm " + std::to_string(rotation.norm()) +
-                    "; 1 is wanted");
-  }
-  Transform result = Transform::Identity();
-  result.linear() = rotation.normalized().toRotationMatrix();
-  result.translation() = translation;
-  return result;
 }
 
 }  // namespace
@@ -385,18 +338,7 @@ std::vector<Packet> packets(const VelodyneScan& message) {
 }
 
 sensor_msgs::PointCloud2Ptr compensatedCloudMessage(const Cloud& cloud) {
-  auto message = boost::make_shared<sensor_msgs::PointCloud2>();
-  message->header.stamp = rosTime(cloud.stamp);
-  message->header.frame_id = cloud.frame_id;
-  const CommonOffsets common = addCommonFields(message.get());
-  const std::uint32_t status = addField("status", PointField::UINT8, message.get());
-  allocatePoints(cloud.size(), message.get());
-  std::uint8_t* point = message->data.data();
-  for (std::size_t i = 0; i < cloud.size(); ++i, point += message->point_step) {
-    putCommon(cloud, i, common, point);
-    put(cloud.status[i], status, point);
-  }
-  return message;
+  return cloudMessage(cloud.stamp, cloud.frame_id, cloud.size(), compensatedCloudBytes(cloud));
 }
 
 Cloud compensatedCloud(const sensor_msgs::PointCloud2& message) {
@@ -447,51 +389,8 @@ Cloud compensatedCloud(const sensor_msgs::PointCloud2& message) {
 
 sensor_msgs::PointCloud2Ptr semanticCloudMessage(const SemanticCloud& cloud,
                                                  const LabelSet& classes) {
-  if (cloud.class_count != classes.size()) {
-    throw DataError("semantic cloud has " + std::to_string(cloud.class_count) +
-                    " classes; the class set has " + std::to_string(classes.size()));
-  }
-  auto message = boost::make_shared<sensor_msgs::PointCloud2>();
-  message->header.stamp = rosTime(cloud.points.stamp);
-  message->header.frame_id = cloud.points.frame_id;
-  const CommonOffsets common = addCommonFields(message.get());
-  const std::uint32_t rgb = addField("rgb", PointField::FLOAT32, message.get());
-  const std::uint32_t label = addField("label", PointField::UINT8, message.get());
-  const std::uint32_t confidence = addField("confidence", PointField::FLOAT32, message.get());
-  const std::uint32_t entropy = addField("entropy", PointField::FLOAT32, message.get());
-  const std::uint32_t cameras = addField("cameras", PointField::UINT16, message.get());
-  const std::uint32_t status = addField("status", PointField::UINT8, message.get());
-  std::uint32_t first_class = 0;
-  for (int id = 0; id < classes.size(); ++id) {
-    const std::uint32_t offset =
-        addField("p_" + classes[id].name, PointField::FLOAT32, message.get());
-    if (id == 0) first_class = offset;
-  }
-  allocatePoints(cloud.size(), message.get());
-
-  std::array<std::uint32_t, 256> rgb_of_label;
-  rgb_of_label.fill(kNoClassRgb);
-  for (int id = 0; id < classes.size(); ++id) {
-    const auto& color = classes[id].color_rgb;
-    rgb_of_label[static_cast<std::size_t>(id)] = static_cast<std::uint32_t>(color[0]) << 16 |
-                                                 static_cast<std::uint32_t>(color[1]) << 8 |
-                                                 color[2];
-  }
-  const std::size_t class_count = static_cast<std::size_t>(cloud.class_count);
-  std::uint8_t* point = message->data.data();
-  for (std::size_t i = 0; i < cloud.size(); ++i, point += message->point_step) {
-    putCommon(cloud.points, i, common, point);
-    put(rgb_of_label[cloud.label[i]], rgb, point);
-    put(cloud.label[i], label, point);
-    put(cloud.confidence[i], confidence, point);
-    put(cloud.entropy[i], entropy, point);
-    put(cloud.cameras[i], cameras, point);
-    put(cloud.points.status[i], status, point);
-    if (class_count == 0) continue;
-    std::memcpy(point + first_class, cloud.probabilities.data() + i * class_count,
-                class_count * sizeof(float));
-  }
-  return message;
+  return cloudMessage(cloud.points.stamp, cloud.points.frame_id, cloud.size(),
+                      semanticCloudBytes(cloud, classes));
 }
 
 sensor_msgs::TimeReference scanReferenceMessage(StampNs scan_ns, StampNs reference_ns) {
@@ -519,15 +418,15 @@ std_msgs::String classInfoMessage(const LabelSet& classes) {
 }
 
 Transform transform(const geometry_msgs::Transform& message) {
-  return checkedTransform({message.translation.x, message.translation.y, message.translation.z},
-                          message.rotation.w, message.rotation.x, message.rotation.y,
-                          message.rotation.z);
+  return transformOf({message.translation.x, message.translation.y, message.translation.z},
+                     message.rotation.w, message.rotation.x, message.rotation.y,
+                     message.rotation.z);
 }
 
 Transform transform(const geometry_msgs::Pose& message) {
-  return checkedTransform({message.position.x, message.position.y, message.position.z},
-                          message.orientation.w, message.orientation.x, message.orientation.y,
-                          message.orientation.z);
+  return transformOf({message.position.x, message.position.y, message.position.z},
+                     message.orientation.w, message.orientation.x, message.orientation.y,
+                     message.orientation.z);
 }
 
 }  // namespace semantic_lidar_fusion

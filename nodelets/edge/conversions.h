@@ -59,19 +59,15 @@ std::vector<Packet> packets(const VelodyneScan& message);
 
 // --- Clouds
 
-/// `points_compensated`: x y z intensity f32, ring u16, dt f32, status u8.
+/// `points_compensated`; see compensatedCloudBytes.
 sensor_msgs::PointCloud2Ptr compensatedCloudMessage(const Cloud& cloud);
 /// Reads `points_compensated` back; fields may stand anywhere, `intensity`, `ring`, `dt` and
 /// `status` may be absent. `first_point_ns` is the stamp plus the least dt, exact to some ns only.
 Cloud compensatedCloud(const sensor_msgs::PointCloud2& message);
 
-/// `points_semantic`: x y z intensity f32, ring u16, dt f32, rgb f32, label u8, confidence f32,
-/// entropy f32, cameras u16, status u8, p_<class> f32 for each class. Throws DataError if the
-/// cloud's class count is not that of `classes`.
+/// `points_semantic`; see semanticCloudBytes.
 sensor_msgs::PointCloud2Ptr semanticCloudMessage(const SemanticCloud& cloud,
                                                  const LabelSet& classes);
-/// Colour (0xRRGGBB) of points without a class.
-constexpr std::uint32_t kNoClassRgb = 0x606060;
 
 // --- Decisions
 

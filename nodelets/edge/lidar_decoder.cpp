@@ -9,32 +9,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-PacketDecoderConfig packetConfig(const LidarConfig& lidar) {
-  PacketDecoderConfig config;
-  config.model = lidar.model;
-  config.packet_stamp = lidar.packet_stamp;
-  config.time_offset_ns = toNs(lidar.time_offset_s);
-  config.min_range_m = lidar.min_range_m;
-  config.max_range_m = lidar.max_range_m;
-  config.longest_scan_ns = toNs(lidar.longest_scan_s);
-  config.vertical_offsets_m = lidar.vertical_offsets_m;
-  return config;
-}
-
-PointCloudReaderConfig cloudConfig(const LidarConfig& lidar) {
-  PointCloudReaderConfig config;
-  config.time_field = lidar.time_field;
-  config.time_unit = lidar.time_unit;
-  config.time_reference = lidar.time_reference;
-  config.without_time = lidar.without_time;
-  config.time_offset_ns = toNs(lidar.time_offset_s);
-  config.min_range_m = lidar.min_range_m;
-  config.max_range_m = lidar.max_range_m;
-  config.largest_coordinate_m = lidar.largest_coordinate_m;
-  config.longest_scan_ns = toNs(lidar.longest_scan_s);
-  return config;
-}
-
 PointCloudBytes cloudBytes(const sensor_msgs::PointCloud2& message, const std::string& frame) {
   PointCloudBytes bytes;
   bytes.header_stamp = stampNs(message.header.stamp);
@@ -59,8 +33,8 @@ LidarDecoder::LidarDecoder(const LidarConfig& config, CountDrops count_drops,
     : config_(config),
       count_drops_(std::move(count_drops)),
       count_left_out_(count_left_out ? std::move(count_left_out) : count_drops_),
-      packets_(packetConfig(config)),
-      clouds_(cloudConfig(config)) {}
+      packets_(config.packetConfig()),
+      clouds_(config.cloudConfig()) {}
 
 std::string LidarDecoder::frame(const std::string& message_frame) const {
   const std::string frame = frameName(config_.frame.empty() ? message_frame : config_.frame);

@@ -1,7 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Tools around the semantic lidar fusion: bags, clouds, class sets, data sets, maps."""
+"""Tools around the semantic lidar fusion: the core for numpy, bags, clouds, class sets, data sets,
+maps."""
 
 import pkgutil
+from typing import TYPE_CHECKING, Optional
+
+if TYPE_CHECKING:
+    from semantic_lidar_fusion.bags.clouds import Clouds
 
 # The compiled module lies in the devel or install space, not beside this file.
 __path__ = pkgutil.extend_path(__path__, __name__)
+
+
+def open_clouds(path: str, topic: Optional[str] = None) -> "Clouds":
+    """The semantic clouds of a fused bag, as a sequence of arrays; see bags/clouds.py."""
+    from semantic_lidar_fusion.bags.clouds import Clouds
+
+    return Clouds(path, topic)

@@ -2,7 +2,7 @@
 """Cameras of sensor_msgs/CameraInfo, and of lens files, for drawing.
 
 The models are the core's own (semantic_lidar_fusion/camera/camera_model.h), called through the
-module _cameras, which is built where pybind11 is installed.
+module semantic_lidar_fusion.core, which is built where pybind11 is installed.
 """
 
 from typing import Any, Mapping, Optional, Tuple
@@ -27,33 +27,30 @@ class Camera:
         max_theta_deg: float = 0.0,
     ):
         try:
-            from semantic_lidar_fusion import _cameras  # type: ignore[attr-defined]
+            from semantic_lidar_fusion import core
         except ImportError as error:
             raise DataError(
-                "camera models need the module _cameras: build with pybind11 and Python.h (%s)"
+                "camera models need the compiled module: build with pybind11 and Python.h (%s)"
                 % error
-            )
+            ) from error
         lens = lens or {}
         self.frame_id: str = lens.get("frame") or info.header.frame_id
         roi = info.roi
-        try:
-            self._model = _cameras.CameraModel(
-                frame=info.header.frame_id,
-                size=(info.width, info.height),
-                distortion_model=info.distortion_model,
-                d=list(info.D),
-                k=list(info.K),
-                r=list(info.R),
-                p=list(info.P),
-                binning=(info.binning_x, info.binning_y),
-                roi=(roi.x_offset, roi.y_offset, roi.width, roi.height),
-                rectified=rectified,
-                max_theta_deg=max_theta_deg,
-                lens_file=lens.get("file") or "",
-                lens_camera=lens.get("camera") or "",
-            )
-        except _cameras.CameraError as error:
-            raise DataError(str(error))
+        self._model = core.CameraModel(
+            frame=info.header.frame_id,
+            size=(info.width, info.height),
+            distortion_model=info.distortion_model,
+            d=list(info.D),
+            k=list(info.K),
+            r=list(info.R),
+            p=list(info.P),
+            binning=(info.binning_x, info.binning_y),
+            roi=(roi.x_offset, roi.y_offset, roi.width, roi.height),
+            rectified=rectified,
+            max_theta_deg=max_theta_deg,
+            lens_file=lens.get("file") or "",
+            lens_camera=lens.get("camera") or "",
+        )
         self.size: Tuple[int, int] = self._model.size
         self.max_theta: float = self._model.max_theta
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the package ships, found in the source tree or the install space."""
+"""What the package ships, found in the source tree, the install space or beside this file."""
 
 import os
 import re
@@ -8,11 +8,13 @@ from semantic_lidar_fusion.errors import ConfigError
 
 
 def package_file(relative: str) -> str:
-    """Path of a file that the package ships, in the source tree or the install space."""
+    """Path of a file that the package ships, in the source tree, in the folder `share` that pip
+    installs, or in the install space."""
     here = os.path.dirname(os.path.abspath(__file__))
-    path = os.path.normpath(os.path.join(here, "..", "..", relative))
-    if os.path.exists(path):
-        return path
+    for root in (os.path.join(here, "..", ".."), os.path.join(here, "share")):
+        path = os.path.normpath(os.path.join(root, relative))
+        if os.path.exists(path):
+            return path
     try:
         import rospkg
 

@@ -558,6 +558,32 @@ void applyOverride(const std::string& text, YAML::Node root) {
 
 }  // namespace
 
+PacketDecoderConfig LidarConfig::packetConfig() const {
+  PacketDecoderConfig config;
+  config.model = model;
+  config.packet_stamp = packet_stamp;
+  config.time_offset_ns = toNs(time_offset_s);
+  config.min_range_m = min_range_m;
+  config.max_range_m = max_range_m;
+  config.longest_scan_ns = toNs(longest_scan_s);
+  config.vertical_offsets_m = vertical_offsets_m;
+  return config;
+}
+
+PointCloudReaderConfig LidarConfig::cloudConfig() const {
+  PointCloudReaderConfig config;
+  config.time_field = time_field;
+  config.time_unit = time_unit;
+  config.time_reference = time_reference;
+  config.without_time = without_time;
+  config.time_offset_ns = toNs(time_offset_s);
+  config.min_range_m = min_range_m;
+  config.max_range_m = max_range_m;
+  config.largest_coordinate_m = largest_coordinate_m;
+  config.longest_scan_ns = toNs(longest_scan_s);
+  return config;
+}
+
 int Rig::referenceCamera() const {
   for (std::size_t i = 0; i < cameras.size(); ++i) {
     if (cameras[i].name == reference.camera) return static_cast<int>(i);

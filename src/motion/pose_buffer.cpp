@@ -43,6 +43,21 @@ void check(const StampedPose& reading) {
 
 }  // namespace
 
+Transform transformOf(const Eigen::Vector3d& translation, double w, double x, double y, double z) {
+  const Eigen::Quaterniond rotation(w, x, y, z);
+  if (!translation.allFinite() || !rotation.coeffs().allFinite()) {
+    throw DataError("transform has a number that is not finite");
+  }
+  if (std::abs(rotation.norm() - 1.0) > 1e-2) {
+    throw DataError("transform has a quaternion of norm " + std::to_string(rotation.norm()) +
+                    "; 1 is wanted");
+  }
+  Transform result = Transform::Identity();
+  result.linear() = rotation.normalized().toRotationMatrix();
+  result.translation() = translation;
+  return result;
+}
+
 Transform interpolate(const Transform& a, const Transform& b, double fraction) {
   // Eigen's slerp takes the shorter way round, whatever the signs of the two quaternions.
   const Eigen::Quaterniond rotation_a = Eigen::Quaterniond(a.linear()).normalized();

@@ -8,7 +8,7 @@ import pytest
 
 bag_factory = pytest.importorskip("bag_factory")
 cv2 = pytest.importorskip("cv2")
-pytest.importorskip("semantic_lidar_fusion._cameras", reason="built with pybind11 only")
+pytest.importorskip("semantic_lidar_fusion._core", reason="built with pybind11 only")
 from bag_factory import CLASS_NAMES, Drive  # noqa: E402
 from semantic_lidar_fusion.rig import Rig  # noqa: E402
 from semantic_lidar_fusion.figures import paper_figures  # noqa: E402

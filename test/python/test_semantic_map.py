@@ -40,7 +40,7 @@ LABELS = LabelSet(
 BACKENDS = [
     False,
     pytest.param(
-        True, marks=pytest.mark.skipif(native_module() is None, reason="_voxel_map is not built")
+        True, marks=pytest.mark.skipif(native_module() is None, reason="_core is not built")
     ),
 ]
 UNIT = 1 << 20
@@ -416,7 +416,7 @@ def test_with_rays_parts_in_order_of_time_change_no_bit(native):
     assert voxel_indices(right.records())[:, 0].min() >= middle + 3
 
 
-@pytest.mark.skipif(native_module() is None, reason="_voxel_map is not built")
+@pytest.mark.skipif(native_module() is None, reason="_core is not built")
 @pytest.mark.parametrize("kind", ["log", "dirichlet"])
 @pytest.mark.parametrize("rays", [0.0, 12.0])
 def test_numpy_gives_the_same_bytes(kind, rays):

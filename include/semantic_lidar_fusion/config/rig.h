@@ -16,7 +16,7 @@
 #include "semantic_lidar_fusion/common/label_set.h"
 #include "semantic_lidar_fusion/config/overlap_rule.h"
 #include "semantic_lidar_fusion/lidar/lidar_spec.h"
-#include "semantic_lidar_fusion/lidar/packet.h"
+#include "semantic_lidar_fusion/lidar/packet_decoder.h"
 #include "semantic_lidar_fusion/lidar/point_cloud_reader.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
 #include "semantic_lidar_fusion/projection/occlusion_config.h"
@@ -92,6 +92,9 @@ struct LidarConfig {
   PacketStamp packet_stamp = PacketStamp::kStart;
   double time_offset_s = 0.0;              ///< key time_offset
   std::vector<double> vertical_offsets_m;  ///< per ring, lowest first; empty = none
+
+  PacketDecoderConfig packetConfig() const;
+  PointCloudReaderConfig cloudConfig() const;
 };
 
 enum class OdometrySource : std::uint8_t { kTf, kTopic };

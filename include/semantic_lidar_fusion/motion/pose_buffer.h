@@ -20,6 +20,10 @@ struct StampedPose {
   Transform T_fixed_vehicle = Transform::Identity();
 };
 
+/// A pose as messages tell it. Throws DataError if a number is not finite or the quaternion's norm
+/// is further than 1e-2 from 1; within that it is normalised.
+Transform transformOf(const Eigen::Vector3d& translation, double w, double x, double y, double z);
+
 /// Linear in translation, slerp in rotation; `fraction` 0 gives a, 1 gives b.
 Transform interpolate(const Transform& a, const Transform& b, double fraction);
 

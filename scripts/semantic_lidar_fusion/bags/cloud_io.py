@@ -230,6 +230,27 @@ class SemanticCloud:
             result[:, column] = self.points[name]
         return result
 
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame with a column for each field and a row for each point. ImportError
+        where pandas is not installed."""
+        import pandas
+
+        return pandas.DataFrame({name: self.points[name] for name in names_of(self.points)})
+
+    def to_open3d(self, colors: Optional[np.ndarray] = None) -> Any:
+        """An open3d.geometry.PointCloud of the points, in the colours of their classes (field rgb)
+        or those given, (N, 3) in 0..1. ImportError where open3d is not installed."""
+        import open3d
+
+        if colors is None and self.optional("rgb") is not None:
+            packed = np.ascontiguousarray(self.points["rgb"]).view(np.uint32)
+            channels = [(packed >> shift) & 255 for shift in (16, 8, 0)]
+            colors = np.stack(channels, axis=-1) / 255.0
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(self.xyz))
+        if colors is not None:
+            cloud.colors = open3d.utility.Vector3dVector(np.asarray(colors, dtype=np.float64))
+        return cloud
+
 
 def append_fields(points: np.ndarray, extra: Dict[str, np.ndarray]) -> np.ndarray:
     """A new structured array (N,) with the fields of `points`, then those of `extra`."""

@@ -106,7 +106,7 @@ class PoseSeries:
         return rotations
 
 
-# As fuse_bag takes them (checkedTransform in nodelets/edge/conversions.cpp).
+# As fuse_bag takes them (transformOf in src/motion/pose_buffer.cpp).
 _NORM_TOLERANCE = 1e-2
 
 

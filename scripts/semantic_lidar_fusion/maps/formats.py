@@ -40,7 +40,7 @@ FORMATS: List[Format] = [
         "octomap",
         "octomap:write_octomap",
         ("map.ot", "map.bt"),
-        ("semantic_lidar_fusion._voxel_map",),
+        ("semantic_lidar_fusion._core",),
     ),
     Format(
         "grid",

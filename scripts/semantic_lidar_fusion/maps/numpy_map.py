@@ -172,7 +172,7 @@ def crossed_voxels(origin: np.ndarray, end: np.ndarray, reach: float) -> np.ndar
 
 
 class NumpyVoxelMap:
-    """The methods of _voxel_map.VoxelMap."""
+    """The methods of _core.VoxelMap."""
 
     def __init__(
         self,

@@ -22,7 +22,7 @@ def write_octomap(source: MapSource, folder: str) -> Dict[str, Any]:
     module = native_module()
     if module is None or not module.has_octomap:
         raise DataError(
-            "OctoMap files need the module _voxel_map, built with pybind11 and liboctomap; leave "
+            "OctoMap files need the module _core, built with pybind11 and liboctomap; leave "
             "octomap out of --formats"
         )
     size = source.config.voxel_size_m
@@ -39,15 +39,12 @@ def write_octomap(source: MapSource, folder: str) -> Dict[str, Any]:
         occupied.append(voxel_indices(chosen))
         label = labels_of(chosen, source.config, source.labels)
         colors.append(class_colors(source.labels, label))
-    try:
-        module.write_octomap(
-            np.concatenate(occupied) - offset,
-            np.concatenate(colors),
-            np.concatenate(free) - offset,
-            size,
-            os.path.join(folder, "map.ot"),
-            os.path.join(folder, "map.bt"),
-        )
-    except module.Error as error:
-        raise DataError(str(error)) from error
+    module.write_octomap(
+        np.concatenate(occupied) - offset,
+        np.concatenate(colors),
+        np.concatenate(free) - offset,
+        size,
+        os.path.join(folder, "map.ot"),
+        os.path.join(folder, "map.bt"),
+    )
     return {"octomap_offset_m": [float(value) for value in offset * size]}

@@ -2,7 +2,7 @@
 """Voxel maps of class distributions: how they are configured, and how points enter.
 
 A map is a set of records of whole numbers and the space that rays crossed (`records`), kept by the
-compiled module semantic_lidar_fusion._voxel_map (include/semantic_lidar_fusion/map/voxel_map.h) or,
+compiled module semantic_lidar_fusion._core (include/semantic_lidar_fusion/map/voxel_map.h) or,
 with the same bytes, by numpy (numpy_map). What points leave does not depend on their order; rays
 count what came after, so that clouds and maps are added in the order of time. Only `reading`
 normalises, clamps and judges.
@@ -108,9 +108,9 @@ class MapConfig:
 
 
 def native_module() -> Optional[Any]:
-    """semantic_lidar_fusion._voxel_map, or None where it is not built."""
+    """semantic_lidar_fusion._core, or None where it is not built."""
     try:
-        return importlib.import_module("semantic_lidar_fusion._voxel_map")
+        return importlib.import_module("semantic_lidar_fusion._core")
     except ImportError:
         return None
 
@@ -125,7 +125,7 @@ class VoxelMap:
         self.dtype = record_dtype(len(labels))
         module = None if native is False else native_module()
         if native and module is None:
-            raise ConfigError("the module semantic_lidar_fusion._voxel_map is not built")
+            raise ConfigError("the module semantic_lidar_fusion._core is not built")
         self.native = module is not None
         make = NumpyVoxelMap if module is None else module.VoxelMap
         self._map: Any = make(

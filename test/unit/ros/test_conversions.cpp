@@ -13,6 +13,7 @@
 
 #include "edge/conversions.h"
 #include "edge/jpeg_decoder.h"
+#include "semantic_lidar_fusion/common/cloud_bytes.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {

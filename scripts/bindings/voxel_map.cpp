@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: MIT
-/// The Python module semantic_lidar_fusion._voxel_map: the core's voxel map for numpy arrays, and
-/// OctoMap files where liboctomap is installed. semantic_lidar_fusion/voxel_map.py is its only user
-/// and checks shapes and types before it calls.
+/// The core's voxel map for numpy arrays, and OctoMap files where liboctomap is installed.
+/// semantic_lidar_fusion/maps/semantic_map.py is its only user and checks shapes and types before
+/// it calls.
+#include "semantic_lidar_fusion/map/voxel_map.h"
+
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
@@ -9,9 +11,10 @@
 #include <string>
 #include <vector>
 
+#include "arrays.h"
+#include "bindings.h"
 #include "octomap_file.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "semantic_lidar_fusion/map/voxel_map.h"
 
 namespace py = pybind11;
 
@@ -27,14 +30,6 @@ py::array checked(const py::array& values, int dimensions, const char* name) {
   if (!py::isinstance<py::array_t<Value>>(values) || values.ndim() != dimensions)
     throw py::value_error(std::string(name) + ": wrong type or shape");
   return values;
-}
-
-/// A 1-D byte array that owns `bytes`.
-py::array asArray(std::vector<std::uint8_t>&& bytes) {
-  auto* const owned = new std::vector<std::uint8_t>(std::move(bytes));
-  const py::capsule owner(owned,
-                          [](void* p) { delete static_cast<std::vector<std::uint8_t>*>(p); });
-  return py::array_t<std::uint8_t>(owned->size(), owned->data(), owner);
 }
 
 VoxelMapConfig makeConfig(double voxel_size_m, bool dirichlet, double weight, double floor,
@@ -104,12 +99,8 @@ void add(VoxelMap* map, const Bytes& records, const Bytes& bricks) {
 }
 
 }  // namespace
-}  // namespace semantic_lidar_fusion
 
-PYBIND11_MODULE(_voxel_map, module) {
-  using namespace semantic_lidar_fusion;  // NOLINT: a module's body is short
-  module.doc() = "Voxel maps of class distributions; use semantic_lidar_fusion.voxel_map.";
-  py::register_exception<Error>(module, "Error");
+void addVoxelMap(py::module_& module) {
   py::class_<VoxelMap>(module, "VoxelMap")
       .def(py::init([](double voxel_size_m, bool dirichlet, double weight, double floor,
                        const std::vector<double>& prior, double min_range_m, double max_range_m,
@@ -121,8 +112,8 @@ PYBIND11_MODULE(_voxel_map, module) {
       .def_property_readonly("memory_bytes", &VoxelMap::memoryBytes)
       .def("integrate", &integrate)
       .def("add", &add)
-      .def("records", [](const VoxelMap& map, bool sorted) { return asArray(map.records(sorted)); })
-      .def("bricks", [](const VoxelMap& map, bool sorted) { return asArray(map.bricks(sorted)); })
+      .def("records", [](const VoxelMap& map, bool sorted) { return arrayOf(map.records(sorted)); })
+      .def("bricks", [](const VoxelMap& map, bool sorted) { return arrayOf(map.bricks(sorted)); })
       .def("keep_inside", &VoxelMap::keepInside)
       .def("clear", &VoxelMap::clear);
   module.attr("has_octomap") = hasOctomap();
@@ -137,3 +128,5 @@ PYBIND11_MODULE(_voxel_map, module) {
                  binary_path);
   });
 }
+
+}  // namespace semantic_lidar_fusion
