@@ -3,6 +3,7 @@
 
 #include <sys/stat.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstring>
 #include <exception>
@@ -58,6 +59,7 @@ void BagInput::open(const std::string& path) {
       topic.datatype = connection->datatype;
     }
     // One pass over the index; messages are not read.
+    if (view.size() > 0) begin_time_ = std::min(begin_time_, view.getBeginTime());
     for (const rosbag::MessageInstance& message : view) {
       ++topics_.at(bareTopic(message.getTopic())).messages;
     }
@@ -66,13 +68,14 @@ void BagInput::open(const std::string& path) {
   }
 }
 
-void BagInput::addTo(const std::vector<std::string>& topics, rosbag::View* view) const {
+void BagInput::addTo(const std::vector<std::string>& topics, rosbag::View* view,
+                     const ros::Time& begin, const ros::Time& end) const {
   std::vector<std::string> names;  // recorders differ in the leading slash
   for (const std::string& topic : topics) {
     names.push_back(bareTopic(topic));
     names.push_back("/" + bareTopic(topic));
   }
-  for (const rosbag::Bag& bag : bags_) view->addQuery(bag, rosbag::TopicQuery(names));
+  for (const rosbag::Bag& bag : bags_) view->addQuery(bag, rosbag::TopicQuery(names), begin, end);
 }
 
 const BagInput::Topic* BagInput::find(const std::string& topic) const {

@@ -27,8 +27,12 @@ class BagInput {
 
   /// The paths, for messages.
   const std::string& path() const { return path_; }
-  /// Adds the messages of these topics of all bags to a view, which merges them by record time.
-  void addTo(const std::vector<std::string>& topics, rosbag::View* view) const;
+  /// Adds the messages of these topics of all bags, recorded within [begin, end], to a view, which
+  /// merges them by record time.
+  void addTo(const std::vector<std::string>& topics, rosbag::View* view,
+             const ros::Time& begin = ros::TIME_MIN, const ros::Time& end = ros::TIME_MAX) const;
+  /// When the first message was recorded.
+  const ros::Time& beginTime() const { return begin_time_; }
 
   /// Type and number of messages of a topic; a leading slash does not matter.
   struct Topic {
@@ -45,6 +49,7 @@ class BagInput {
   void open(const std::string& path);
 
   std::string path_;
+  ros::Time begin_time_ = ros::TIME_MAX;
   std::deque<rosbag::Bag> bags_;         ///< in the order of the command line; a bag cannot move
   std::map<std::string, Topic> topics_;  ///< by name without leading slash
 };

@@ -1,233 +1,406 @@
 // SPDX-License-Identifier: MIT
 #include "tools/fuse_bag/bag_fusion.h"
 
+#include <yaml-cpp/yaml.h>
+
 #include <algorithm>
 #include <utility>
 
-#include "edge/topics.h"
 #include "semantic_lidar_fusion/common/error.h"
-#include "tools/common/progress_bar.h"
 
 namespace semantic_lidar_fusion {
+namespace {
 
-BagFusion::BagFusion(const FuseBagOptions& options, void (*checkpoint)())
-    : options_(options),
-      checkpoint_(checkpoint),
-      rig_(loadRig(options.rig, options.overrides)),
-      report_(rig_.cameras.size()),
-      pipeline_(rig_),
-      input_(options.inputs),
-      poses_(tfPoseSourceConfig(rig_, 0)),
-      scans_(rig_, &drops_),
-      models_(rig_.cameras.size()) {}
+/// How far ahead of a scan is read before it is decided, one after the other. The first holds what
+/// drivers and networks take on a vehicle.
+const std::optional<double> kAheadS[] = {0.5, 5.0, std::nullopt};
+/// A decision is looked at again when so many times that is read; then at the end.
+constexpr double kSecondLook = 10.0;
+/// What a scan needs was recorded at most so long before it, mostly; else it is read again.
+constexpr double kBehindS = 0.5;
+/// Messages that are kept in memory until the scans that may need them are decided.
+constexpr std::size_t kKeptBytes = 384u << 20;
+/// With --start and --end: what is read around the scans that count.
+constexpr double kBeforeS = 5.0, kAfterS = 10.0;
 
-void BagFusion::run() {
-  BagOutput output(options_.output, "fuse_bag",
-                   options_.force ? Existing::kReplace : Existing::kReplaceOwn);
-  try {
-    fuseInto(&output);
-  } catch (const rosbag::BagException& e) {
-    throw Error(bagErrorText(input_.path(), e));
-  }
-  output.commit();
+/// A scan would be decided otherwise with what was read after it.
+struct Unsettled {};
+
+ReadingWindow windowOf(const FuseBagOptions& options, bool all_ahead) {
+  ReadingWindow window;
+  window.start_s = options.start_s;
+  window.end_s = options.end_s;
+  window.before_s = kBeforeS;
+  window.after_s = all_ahead ? ros::TIME_MAX.toSec() : kAfterS;
+  window.kept_bytes = all_ahead ? 0 : kKeptBytes;
+  return window;
 }
 
-void BagFusion::fuseInto(BagOutput* output) {
-  index_ = indexDrive(input_, rig_, &poses_, &drops_, !options_.quiet, checkpoint_);
-  if (options_.true_visibility) truth_.emplace(input_, toNs(rig_.lidar.time_offset_s));
-  ProductWriter writer(rig_, pipeline_, index_, output);
-  ImageSource images(
-      rig_, index_, &pipeline_, &drops_,
-      [&](std::size_t camera, const SegmentedImage& image) {
-        if (options_.all) writer.writeImage(camera, image);
-      },
-      [&](const std::string& note) {
-        if (!options_.quiet) DropLog::note(note);
-      });
-  measureScans();
-  ScanSource::Candidates candidates;
-  for (std::size_t c = 0; c < rig_.cameras.size(); ++c) candidates.push_back(images.candidates(c));
-  scans_.select(candidates);
-  fuseScans(&images, &writer);
-  if (options_.tf) writer.copyTransforms();
-  if (report_.scansWritten() == 0) {
-    const std::size_t count = index_.scans.size();
+/// Their files are made at once: what stands in the way is told before the bag is read.
+std::deque<FusedOutput> madeOutputs(const FuseBagOptions& options,
+                                    const std::vector<OutputOptions>& outputs,
+                                    const std::vector<Rig>& rigs) {
+  std::deque<FusedOutput> made;
+  for (std::size_t i = 0; i < rigs.size(); ++i) made.emplace_back(options, outputs[i], rigs[i]);
+  return made;
+}
+
+/// FNV-1a.
+void addTo(std::uint64_t* hash, const void* data, std::size_t size) {
+  const auto* bytes = static_cast<const std::uint8_t*>(data);
+  for (std::size_t i = 0; i < size; ++i) *hash = (*hash ^ bytes[i]) * 0x100000001b3u;
+}
+
+}  // namespace
+
+FusionRun::FusionRun(const FuseBagOptions& options, const std::vector<OutputOptions>& outputs,
+                     const std::vector<Rig>& rigs, const BagInput& input,
+                     std::optional<double> ahead_s)
+    : options_(options),
+      rig_(rigs.front()),
+      input_(input),
+      ahead_s_(ahead_s),
+      poses_(tfPoseSourceConfig(rig_, 0)),
+      outputs_(madeOutputs(options, outputs, rigs)),
+      reader_(input, rig_, windowOf(options, !ahead_s), &poses_, &drops_,
+              [this](const rosbag::MessageInstance& message) { scans_->take(message); }),
+      images_(rig_, reader_.index(), options.all),
+      places_(rig_, reader_.index(), poses_, &drops_),
+      progress_("fusing", reader_.scanCount(), !options.quiet),
+      most_under_way_(static_cast<std::size_t>(options.jobs) + 2) {
+  const bool takes_truth =
+      std::any_of(outputs.begin(), outputs.end(),
+                  [](const OutputOptions& output) { return output.true_visibility; });
+  if (takes_truth) truth_.emplace(input, toNs(rig_.lidar.time_offset_s));
+  scans_ = std::make_unique<ScanSource>(rig_, reader_.index(), images_, &places_, &drops_);
+}
+
+// --- The lines, from the end of a scan's way to its beginning
+
+std::size_t FusionRun::fuseLine(const ScanTask& task) const {
+  return 1 + task.scan.number % static_cast<std::size_t>(options_.jobs);
+}
+
+std::size_t FusionRun::imageLine(std::size_t camera) const {
+  return 1 + static_cast<std::size_t>(options_.jobs) + images_.lineOf(camera);
+}
+
+std::size_t FusionRun::readLine() const {
+  return 1 + static_cast<std::size_t>(options_.jobs) + images_.lineCount();
+}
+
+bool FusionRun::fuse(void (*checkpoint)()) {
+  WorkLines lines(options_.jobs, readLine() + 1);
+  lines_ = &lines;
+  lines.add(readLine(), [this] { readOn(); });
+  try {
+    lines.wait(checkpoint);
+  } catch (const Unsettled&) {
+    return false;
+  }
+  reader_.finish();
+  scans_->tellNotes();
+  if (options_.tf) {
+    for (FusedOutput& output : outputs_) output.copyTransforms(reader_.index().transforms);
+  }
+  for (const FusedOutput& output : outputs_) {
+    if (output.report().scansWritten() > 0) continue;
+    const std::size_t count = scans_->taken();
     throw Error(input_.path() + ": none of its " + std::to_string(count) + " scan" +
                 (count == 1 ? "" : "s") + " can be used");
   }
+  for (FusedOutput& output : outputs_) output.commit();
+  return true;
 }
 
-void BagFusion::measureScans() {
-  ProgressBar progress("measuring", index_.scans.size(), !options_.quiet);
-  scans_.measure(
-      index_.scans,
-      [&](std::size_t camera, const ros::Time& time, const std::string& lidar_frame) {
-        return place(camera, time, lidar_frame);
-      },
-      [&] {
-        progress.update(scans_.scans().size());
-        checkpoint_();
-      });
+// --- Reading and deciding
+
+bool FusionRun::isReady(const BagScan& scan) const {
+  return has_ended_ ||
+         (ahead_s_ && reader_.time().toSec() >= scan.message.getTime().toSec() + *ahead_s_);
 }
 
-void BagFusion::fuseScans(ImageSource* images, ProductWriter* writer) {
-  ProgressBar progress("fusing", scans_.scans().size(), !options_.quiet);
-  std::size_t done = 0;
-  for (const BagScan& scan : scans_.scans()) {
-    if (scan.usable) {
-      try {
-        fuseScan(scan, images, writer);
-      } catch (const DataError& e) {
-        drops_.count("scans: not fused",
-                     "scan " + std::to_string(done) + " is dropped: " + e.what());
-      }
+/// Reads until a scan can start, starts it, and stands in line again.
+void FusionRun::readOn() {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    is_reading_ = under_way_.size() < most_under_way_;
+    if (!is_reading_) return;  // writeScan wakes it
+  }
+  constexpr int kMostMessages = 64;  // then others may come first
+  for (int i = 0; i < kMostMessages; ++i) {
+    const BagScan* waiting = scans_->waiting();
+    if (waiting != nullptr && isReady(*waiting)) {
+      start(scans_->decide());
+      waiting = scans_->waiting();
+      reader_.release(waiting ? waiting->message.getTime() : reader_.time(), kBehindS);
+      break;
     }
-    progress.update(++done);
-    checkpoint_();
+    if (has_ended_) {
+      if (!std::all_of(decided_.begin(), decided_.end(),
+                       [this](const Decided& decided) { return holds(decided); }) ||
+          places_.haveChanged()) {
+        throw Unsettled();
+      }
+      return;
+    }
+    has_ended_ = !reader_.readOne();
+    lookAgain();
+  }
+  lines_->add(readLine(), [this] { readOn(); });
+}
+
+/// At decisions that were made a while ago, so that a bag of another order is noticed early.
+void FusionRun::lookAgain() {
+  if (!ahead_s_) return;
+  const double until_s = reader_.time().toSec() - kSecondLook * *ahead_s_;
+  for (; checked_ < decided_.size(); ++checked_) {
+    if (decided_[checked_].scan.message.getTime().toSec() > until_s) return;
+    if (!holds(decided_[checked_])) throw Unsettled();
   }
 }
 
-/// The way of one scan: decode, compensate, segment and view each camera's image, fuse, write.
-void BagFusion::fuseScan(const BagScan& scan, ImageSource* images, ProductWriter* writer) {
-  const TimedCloud raw = scans_.decode(*scan.message);
-  const std::optional<Transform> T_vehicle_lidar =
-      rig_.motion_enabled ? extrinsics(rig_.vehicle_frame, raw.frame_id, "all points have status 4")
-                          : std::nullopt;
-  const PoseBuffer& odometry = poses_.odometry();
-  const CompensationResult rigid =
-      pipeline_.compensate(raw, scan.reference_ns, odometry, T_vehicle_lidar);
-
-  std::vector<CameraView> views;
-  ScanImages used(rig_.cameras.size());
-  for (std::size_t c = 0; c < used.size(); ++c) {
-    const std::optional<StampNs>& stamp = scan.image_stamps[c];
-    const CameraPlace at = place(c, infoTime(scan, c), raw.frame_id);
-    if (stamp && at.model) used[c] = images->image(c, *stamp, at.model->imageSize());
-    views.push_back(
-        pipeline_.view(c, at, used[c].get(), scan.reference_ns, odometry, T_vehicle_lidar));
-    countCamera(scan, c, used[c] != nullptr, views.back());
+/// The times at which the camera_info in force is that of a scan's images.
+std::vector<ros::Time> FusionRun::infoTimes(const BagScan& scan) const {
+  std::vector<ros::Time> times(rig_.cameras.size(), scan.message.getTime());
+  for (std::size_t c = 0; c < times.size(); ++c) {
+    const ImagesByStamp& images = reader_.index().cameras[c].images;
+    const auto image = scan.image_stamps[c] ? images.find(*scan.image_stamps[c]) : images.end();
+    if (image != images.end()) times[c] = image->second.place.getTime();
   }
-  for (const std::string& note : calibration_notes_.news(rig_, views)) DropLog::warn(note);
-  if (truth_) truth_->apply(scan.times.interval.first_ns, rigid.cloud.size(), &views);
-  const FusionResult result = pipeline_.fuse(rigid.cloud, views, options_.all);
-  if (!result.note.empty() && told_notes_.insert(result.note).second && !options_.quiet) {
-    DropLog::note(result.note);
-  }
-
-  writer->writeScan(scan.times.interval.first_ns, scan.image_stamps, rigid.cloud, result.cloud);
-  if (options_.all) writer->writeOverlays(result, used, views, rigid.cloud.stamp);
-  report_.countScan(result.cloud.points);
-  countDrops(scan, T_vehicle_lidar || !rig_.motion_enabled, rigid, result);
+  return times;
 }
 
-/// The time at which the camera_info in force is that of a scan's image.
-ros::Time BagFusion::infoTime(const BagScan& scan, std::size_t camera) const {
-  const std::optional<StampNs>& stamp = scan.image_stamps[camera];
-  const MessagesByStamp& images = index_.cameras[camera].images;
-  const auto image = stamp ? images.find(*stamp) : images.end();
-  return image == images.end() ? scan.message->getTime() : image->second.getTime();
+/// A sum over all readings that have a part in the poses of a scan.
+std::uint64_t FusionRun::posesAround(const BagScan& scan) {
+  constexpr std::ptrdiff_t kBeside = 3;  // as many have a part in what a jump is
+  StampNs from = std::min(scan.times.interval.first_ns, scan.reference_ns);
+  StampNs to = std::max(scan.times.interval.last_ns, scan.reference_ns);
+  for (std::size_t c = 0; c < scan.image_stamps.size(); ++c) {
+    if (!scan.image_stamps[c]) continue;
+    const StampNs time = images_.pipeline().imageTime(c, *scan.image_stamps[c]);
+    from = std::min(from, time);
+    to = std::max(to, time);
+  }
+  const auto& readings = poses_.odometry().readings();
+  const auto earlier = [](const StampedPose& reading, StampNs t) { return reading.stamp < t; };
+  auto begin = std::lower_bound(readings.begin(), readings.end(), from, earlier);
+  auto end = std::lower_bound(begin, readings.end(), to, earlier);
+  begin -= std::min(kBeside, begin - readings.begin());
+  end += std::min<std::ptrdiff_t>(1, readings.end() - end);
+  std::uint64_t sum = 0xcbf29ce484222325u;
+  for (auto reading = begin; reading != end; ++reading) {
+    addTo(&sum, &reading->stamp, sizeof(reading->stamp));
+    addTo(&sum, reading->T_fixed_vehicle.data(), 16 * sizeof(double));
+  }
+  return sum;
 }
 
-void BagFusion::countCamera(const BagScan& scan, std::size_t camera, bool has_image,
-                            const CameraView& view) {
-  if (view.has_image) {
-    report_.countCamera(camera, RunReport::Contribution::kUsed);
-    return;
-  }
-  const bool was_chosen = scan.image_stamps[camera].has_value();
-  report_.countCamera(camera,
-                      was_chosen ? RunReport::Contribution::kLost : RunReport::Contribution::kNone);
-  if (has_image) {
-    const std::string name = "camera " + rig_.cameras[camera].name;
-    drops_.count(name + ": odometry does not cover its image",
-                 name + ": " + poses_.gap(scan.reference_ns, view.image_ns));
-  }
+std::ptrdiff_t FusionRun::camerasWithInfo() const {
+  const auto& cameras = reader_.index().cameras;
+  return std::count_if(cameras.begin(), cameras.end(),
+                       [](const CameraTrack& track) { return !track.infos.empty(); });
 }
 
-void BagFusion::countDrops(const BagScan& scan, bool has_vehicle_extrinsics,
-                           const CompensationResult& rigid, const FusionResult& result) {
-  if (!has_vehicle_extrinsics) {
-    drops_.add("scans: no extrinsics of the lidar", 1);  // said when they were looked for
-  } else if (!rigid.counters.reference_covered) {
-    drops_.count("scans: odometry does not cover t_ref",
-                 poses_.gap(scan.reference_ns, scan.reference_ns));
-  } else if (rigid.counters.marked_points + rigid.counters.dropped_points > 0) {
-    drops_.count("firings: odometry does not cover them",
-                 poses_.gap(scan.times.interval.first_ns, scan.times.interval.last_ns),
-                 rigid.counters.uncovered_firings);
-  }
-  drops_.add("points: odometry missing, on_missing: drop", rigid.counters.dropped_points);
-  drops_.add("points: without a class, keep_unlabelled: false",
-             rigid.cloud.size() - result.cloud.size());
-  for (const CameraFusionReport& report : result.cameras) {
-    drops_.add("camera " + report.name + ": points on scores that are not finite (uniform)",
-               report.nonfinite);
-  }
+/// Whether a decision would come out the same with what is known by now.
+bool FusionRun::holds(const Decided& decided) {
+  return scans_->holds(decided.scan) && camerasWithInfo() == decided.cameras_with_info &&
+         posesAround(decided.scan) == decided.poses;
 }
 
-CameraPlace BagFusion::place(std::size_t camera, const ros::Time& time,
-                             const std::string& lidar_frame) {
-  CameraPlace result;
-  const CameraConfig& config = rig_.cameras[camera];
-  const CameraInfo* known = cameraInfoAt(index_.cameras[camera], time);
-  if (!known && !config.withoutCameraInfo()) return result;
-  const CameraInfo info = known ? *known : config.assumedInfo();
-  const std::string& frame = config.lens.frame.empty() ? info.frame_id : config.lens.frame;
-  const std::string outcome = "camera " + rig_.cameras[camera].name + " sees nothing (status 2)";
-  const std::optional<Transform> T_camera_lidar = extrinsics(frame, lidar_frame, outcome);
-  if (!T_camera_lidar) return result;
-  result.T_camera_lidar = *T_camera_lidar;
-  result.model = model(camera, info);
-  return result;
-}
-
-std::shared_ptr<const CameraModel> BagFusion::model(std::size_t camera, const CameraInfo& info) {
-  auto& models = models_[camera];
-  const auto known = std::find_if(models.begin(), models.end(),
-                                  [&](const auto& model) { return model.first == info; });
-  if (known != models.end()) return known->second;
-  const CameraConfig& config = rig_.cameras[camera];
-  std::shared_ptr<const CameraModel> result;
+void FusionRun::start(BagScan scan) {
+  const auto task = std::make_shared<ScanTask>(std::move(scan));
   try {
-    result = std::make_shared<const CameraModel>(info, config.modelOptions());
+    plan(task);
   } catch (const DataError& e) {
-    drops_.count("camera " + config.name + ": unusable camera_info",
-                 inputTopic(config, config.camera_info) + ": " + e.what());
+    drops_.count("scans: not fused",
+                 "scan " + std::to_string(task->scan.number) + " is dropped: " + e.what());
   }
-  models.emplace_back(info, result);
-  return result;
 }
 
-std::optional<Transform> BagFusion::extrinsics(const std::string& target, const std::string& source,
-                                               const std::string& consequence) {
-  const auto key = std::make_pair(target, source);
-  const auto known = extrinsics_.find(key);
-  if (known != extrinsics_.end()) return known->second;
-  const TransformAnswer answer = poses_.extrinsics(target, source);
-  if (!answer) DropLog::warn("no extrinsics " + answer.message + "; " + consequence);
-  extrinsics_[key] = answer.transform;
-  return answer.transform;
+void FusionRun::plan(const std::shared_ptr<ScanTask>& task) {
+  TimedCloud raw = scans_->points(&task->scan);
+  const std::vector<ros::Time> info_times = infoTimes(task->scan);
+  const auto& cameras = reader_.index().cameras;
+  decided_.push_back({task->scan, camerasWithInfo(), posesAround(task->scan)});
+
+  task->images.resize(cameras.size());
+  for (std::size_t c = 0; c < cameras.size(); ++c) {
+    const std::optional<StampNs>& stamp = task->scan.image_stamps[c];
+    const CameraPlace place = places_.at(c, info_times[c], raw.frame_id);
+    if (!stamp || !place.model) continue;
+    bool is_new = false;
+    task->images[c] = images_.find(c, *stamp, place.model->imageSize(), &is_new);
+    if (is_new) task->new_images.push_back(task->images[c]);
+  }
+  for (FusedOutput& output : outputs_) {
+    task->outputs.push_back(output.plan(*task, raw, &poses_, &places_, info_times,
+                                        output.takesTruth() ? &*truth_ : nullptr));
+  }
+  launch(task);
 }
 
-std::string BagFusion::whyNothingIsFused() const {
-  if (rig_.cameras.empty() || report_.fusedPoints() > 0) return {};
-  std::string text = input_.path() + ": no point got a class: " + report_.commonestStatus();
-  for (const auto& drop : drops_.counts()) {
-    text += "; " + drop.first + ": " + std::to_string(drop.second);
+/// Hands a planned scan over to the other lines.
+void FusionRun::launch(const std::shared_ptr<ScanTask>& task) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  under_way_.push_back(task);
+  for (const auto& image : task->images) {
+    if (image && !image->is_made) ++task->missing_images;
   }
-  return text + ". " + options_.output + " is written; check_rig.py looks for the cause";
+  for (const auto& image : task->new_images) {
+    lines_->add(imageLine(image->camera), [this, image] {
+      images_.make(image.get());
+      imageMade(image);
+    });
+  }
+  if (task->missing_images == 0) lines_->add(fuseLine(*task), [this, task] { fuseScan(task); });
+}
+
+// --- What the other lines do
+
+void FusionRun::imageMade(const std::shared_ptr<ImageTask>& image) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  image->is_made = true;
+  for (const auto& task : under_way_) {
+    const std::ptrdiff_t uses = std::count(task->images.begin(), task->images.end(), image);
+    if (uses == 0) continue;
+    --task->missing_images;
+    if (task->missing_images == 0) lines_->add(fuseLine(*task), [this, task] { fuseScan(task); });
+  }
+}
+
+void FusionRun::fuseScan(const std::shared_ptr<ScanTask>& task) {
+  for (std::size_t i = 0; i < outputs_.size(); ++i) outputs_[i].fuse(*task, &task->outputs[i]);
+  const std::lock_guard<std::mutex> lock(mutex_);
+  task->is_fused = true;
+  for (const auto& next : under_way_) {
+    if (!next->is_fused) break;
+    if (std::exchange(next->is_written, true)) continue;
+    lines_->add(0, [this, next] { writeScan(*next); });
+  }
+}
+
+void FusionRun::writeScan(const ScanTask& task) {
+  for (const auto& image : task.images) {
+    if (!image || image->image) continue;
+    const std::string name = "camera " + rig_.cameras[image->camera].name;
+    drops_.count(name + ": unusable images or scores",
+                 name + ", image " + std::to_string(image->stamp) + " ns: " + image->failure);
+  }
+  for (std::size_t i = 0; i < outputs_.size(); ++i) {
+    outputs_[i].write(task, task.outputs[i], images_.pipeline());
+  }
+  progress_.update(++written_);
+  const std::lock_guard<std::mutex> lock(mutex_);
+  under_way_.pop_front();
+  if (!std::exchange(is_reading_, true)) lines_->add(readLine(), [this] { readOn(); });
+}
+
+// --- Reports
+
+std::map<std::string, std::uint64_t> FusionRun::dropsOf(const FusedOutput& output) const {
+  std::map<std::string, std::uint64_t> drops = drops_.counts();
+  for (const auto& drop : output.drops().counts()) drops[drop.first] += drop.second;
+  return drops;
+}
+
+std::string FusionRun::whyNothingIsFused() const {
+  for (const FusedOutput& output : outputs_) {
+    const RunReport& report = output.report();
+    if (rig_.cameras.empty() || report.fusedPoints() > 0) continue;
+    std::string text = input_.path() + ": no point got a class: " + report.commonestStatus();
+    for (const auto& drop : dropsOf(output)) {
+      text += "; " + drop.first + ": " + std::to_string(drop.second);
+    }
+    return text + ". " + output.path() + " is written; check_rig.py looks for the cause";
+  }
+  return {};
+}
+
+std::string FusionRun::summary() const {
+  std::string text;
+  for (const FusedOutput& output : outputs_) {
+    RunReport::Input input;
+    input.output = output.path();
+    input.scans = scans_->taken();
+    input.time_decision = scans_->timeDecision();
+    for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
+      const CameraTrack& track = reader_.index().cameras[c];
+      input.cameras.push_back({rig_.cameras[c].name, track.images.size(), track.semantics.size()});
+    }
+    text += output.report().text(input, dropsOf(output));
+  }
+  return text;
+}
+
+// --- All runs
+
+namespace {
+
+/// What of a rig says how the bag is read and its images are made: all but what comes after.
+std::string readingOf(const Rig& rig) {
+  YAML::Node root = YAML::Load(rig.yaml);
+  for (const char* key : {"motion", "occlusion", "overlap", "smoothing", "uncertainty",
+                          "keep_unlabelled", "threads"}) {
+    root.remove(key);
+  }
+  for (const char* key : {"lookup", "on_missing", "max_extrapolation"}) {
+    root["odometry"].remove(key);
+  }
+  return YAML::Dump(root);
+}
+
+}  // namespace
+
+BagFusion::BagFusion(const FuseBagOptions& options, void (*checkpoint)())
+    : options_(options), checkpoint_(checkpoint), input_(options.inputs) {
+  for (const OutputOptions& output : options.outputs) {
+    Rig rig = loadRig(options.rig, output.overrides);
+    const std::string reading = readingOf(rig);
+    const auto known = std::find_if(groups_.begin(), groups_.end(),
+                                    [&](const Group& group) { return group.reading == reading; });
+    Group& group = known == groups_.end() ? groups_.emplace_back() : *known;
+    group.reading = reading;
+    group.outputs.push_back(output);
+    group.rigs.push_back(std::move(rig));
+  }
+}
+
+void BagFusion::run() {
+  for (Group& group : groups_) {
+    try {
+      run(&group);
+    } catch (const rosbag::BagException& e) {
+      throw Error(bagErrorText(input_.path(), e));
+    }
+  }
+}
+
+void BagFusion::run(Group* group) {
+  for (const std::optional<double>& ahead_s : kAheadS) {
+    group->run.reset();  // its files go first
+    group->run =
+        std::make_unique<FusionRun>(options_, group->outputs, group->rigs, input_, ahead_s);
+    if (group->run->fuse(checkpoint_)) return;
+    if (!options_.quiet) {
+      DropLog::note("a scan needs what was recorded more than " + std::to_string(*ahead_s) +
+                    " s after it; the bag is read again, further ahead");
+    }
+  }
 }
 
 std::string BagFusion::summary() const {
-  RunReport::Input input;
-  input.output = options_.output;
-  input.scans = scans_.scans().size();
-  input.time_decision = scans_.timeDecision();
-  for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
-    const CameraTrack& track = index_.cameras[c];
-    input.cameras.push_back({rig_.cameras[c].name, track.images.size(), track.semantics.size()});
+  std::string text;
+  for (const Group& group : groups_) text += group.run->summary();
+  return text;
+}
+
+std::string BagFusion::whyNothingIsFused() const {
+  for (const Group& group : groups_) {
+    const std::string why = group.run->whyNothingIsFused();
+    if (!why.empty()) return why;
   }
-  return report_.text(input, drops_);
+  return {};
 }
 
 }  // namespace semantic_lidar_fusion

@@ -1,75 +1,135 @@
 // SPDX-License-Identifier: MIT
-/// The whole pipeline over a bag, scan by scan.
+/// The whole pipeline over a bag. One line of work reads the bag once, in the order of its
+/// recording, decides about each scan as soon as what it needs is read, and compensates it. The
+/// images of each camera are made in a line of their own, scans are fused side by side, and one
+/// line writes them in the order of the bag: WorkLines shares these lines among the threads, and
+/// the result does not depend on how many there are.
+///
+/// What a scan needs may stand anywhere in a bag. It is looked for within a while after the scan;
+/// at the end each decision is made again with all that the bag holds, and where one comes out
+/// otherwise, the bag is read again, further ahead.
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
+#include <deque>
 #include <map>
 #include <memory>
+#include <mutex>
 #include <optional>
-#include <set>
 #include <string>
-#include <utility>
 #include <vector>
 
 #include "edge/tf_pose_source.h"
-#include "semantic_lidar_fusion/fusion/calibration_notes.h"
-#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "tools/common/bag_input.h"
-#include "tools/common/bag_output.h"
-#include "tools/fuse_bag/drive_index.h"
+#include "tools/common/progress_bar.h"
+#include "tools/common/work_lines.h"
+#include "tools/fuse_bag/camera_places.h"
+#include "tools/fuse_bag/drive_reader.h"
 #include "tools/fuse_bag/drop_log.h"
 #include "tools/fuse_bag/fuse_bag_options.h"
+#include "tools/fuse_bag/fused_output.h"
 #include "tools/fuse_bag/image_source.h"
-#include "tools/fuse_bag/product_writer.h"
-#include "tools/fuse_bag/run_report.h"
 #include "tools/fuse_bag/scan_source.h"
 #include "tools/fuse_bag/truth.h"
 
 namespace semantic_lidar_fusion {
 
-class BagFusion {
+/// One run over the bags that looks so far ahead of a scan.
+class FusionRun {
  public:
-  /// `checkpoint` is called between steps and may throw to end the work. Throws Error.
-  BagFusion(const FuseBagOptions& options, void (*checkpoint)());
+  /// Keeps the references. `rigs`: of each output. `ahead_s`: empty for all of the bag.
+  FusionRun(const FuseBagOptions& options, const std::vector<OutputOptions>& outputs,
+            const std::vector<Rig>& rigs, const BagInput& input, std::optional<double> ahead_s);
 
-  /// Reads the input and writes the output. Throws Error; the output is then as before.
-  void run();
+  /// False if a scan needs what the bag holds further ahead; nothing is written then. `checkpoint`
+  /// is called now and then and may throw to end the work. Throws Error.
+  bool fuse(void (*checkpoint)());
   /// What came in, what came out, and what was dropped and why.
   std::string summary() const;
-  /// Why no point got a class though the rig has cameras; empty if one did.
+  /// Why no point of some output got a class though the rig has cameras; empty if they did.
   std::string whyNothingIsFused() const;
 
  private:
-  void fuseInto(BagOutput* output);
-  void measureScans();
-  void fuseScans(ImageSource* images, ProductWriter* writer);
-  void fuseScan(const BagScan& scan, ImageSource* images, ProductWriter* writer);
-  ros::Time infoTime(const BagScan& scan, std::size_t camera) const;
-  void countCamera(const BagScan& scan, std::size_t camera, bool has_image, const CameraView& view);
-  void countDrops(const BagScan& scan, bool has_vehicle_extrinsics, const CompensationResult& rigid,
-                  const FusionResult& result);
+  struct Decided;
 
-  CameraPlace place(std::size_t camera, const ros::Time& time, const std::string& lidar_frame);
-  std::shared_ptr<const CameraModel> model(std::size_t camera, const CameraInfo& info);
-  std::optional<Transform> extrinsics(const std::string& target, const std::string& source,
-                                      const std::string& consequence);
+  std::size_t fuseLine(const ScanTask& task) const;
+  std::size_t imageLine(std::size_t camera) const;
+  std::size_t readLine() const;
+
+  void readOn();
+  bool isReady(const BagScan& scan) const;
+  void start(BagScan scan);
+  void plan(const std::shared_ptr<ScanTask>& task);
+  void launch(const std::shared_ptr<ScanTask>& task);
+  void imageMade(const std::shared_ptr<ImageTask>& image);
+  void fuseScan(const std::shared_ptr<ScanTask>& task);
+  void writeScan(const ScanTask& task);
+  std::vector<ros::Time> infoTimes(const BagScan& scan) const;
+  std::uint64_t posesAround(const BagScan& scan);
+  std::ptrdiff_t camerasWithInfo() const;
+  bool holds(const Decided& decided);
+  void lookAgain();
+  std::map<std::string, std::uint64_t> dropsOf(const FusedOutput& output) const;
+
+  const FuseBagOptions& options_;
+  const Rig& rig_;  ///< of the first output; the others read the same
+  const BagInput& input_;
+  std::optional<double> ahead_s_;
+  DropLog drops_;
+  TfPoseSource poses_;
+  std::deque<FusedOutput> outputs_;
+  std::unique_ptr<ScanSource> scans_;
+  DriveReader reader_;
+  ImageSource images_;
+  CameraPlaces places_;
+  std::optional<VisibilityTruth> truth_;
+  ProgressBar progress_;
+  std::size_t written_ = 0;
+
+  /// Of the reading line.
+  struct Decided {
+    BagScan scan;
+    std::ptrdiff_t cameras_with_info;
+    std::uint64_t poses;  ///< see posesAround
+  };
+  bool has_ended_ = false;  ///< all is read
+  std::deque<Decided> decided_;
+  std::size_t checked_ = 0;  ///< of them, so many were looked at again
+
+  std::mutex mutex_;  ///< guards what follows, and the states of tasks
+  std::deque<std::shared_ptr<ScanTask>> under_way_;  ///< in the order of the bag
+  std::size_t most_under_way_;
+  bool is_reading_ = true;  ///< a task of the reading line waits or runs
+  WorkLines* lines_ = nullptr;
+};
+
+/// All runs: outputs whose rigs read the bag alike share one.
+class BagFusion {
+ public:
+  /// Throws Error, ConfigError.
+  BagFusion(const FuseBagOptions& options, void (*checkpoint)());
+
+  /// Reads the input and writes the outputs. Throws Error; the outputs of the run that failed are
+  /// then as before.
+  void run();
+  std::string summary() const;
+  std::string whyNothingIsFused() const;
+
+ private:
+  struct Group {
+    std::string reading;
+    std::vector<OutputOptions> outputs;
+    std::vector<Rig> rigs;
+    std::unique_ptr<FusionRun> run;
+  };
+
+  void run(Group* group);
 
   FuseBagOptions options_;
   void (*checkpoint_)();
-  DropLog drops_;
-  Rig rig_;
-  RunReport report_;
-  ScanPipeline pipeline_;
   BagInput input_;
-  TfPoseSource poses_;
-  DriveIndex index_;
-  std::optional<VisibilityTruth> truth_;
-  ScanSource scans_;
-  /// By camera.
-  std::vector<std::vector<std::pair<CameraInfo, std::shared_ptr<const CameraModel>>>> models_;
-  CalibrationNotes calibration_notes_;
-  std::set<std::string> told_notes_;
-  std::map<std::pair<std::string, std::string>, std::optional<Transform>> extrinsics_;
+  std::deque<Group> groups_;
 };
 
 }  // namespace semantic_lidar_fusion

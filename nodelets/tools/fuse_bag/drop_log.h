@@ -3,34 +3,27 @@
 #pragma once
 
 #include <cstdint>
-#include <cstdio>
 #include <map>
+#include <mutex>
 #include <string>
 
 namespace semantic_lidar_fusion {
 
+/// May be used by several threads.
 class DropLog {
  public:
   /// `reason` is a short text without numbers; `detail` names the thing and the value.
-  void count(const std::string& reason, const std::string& detail, std::uint64_t n = 1) {
-    if (n == 0) return;
-    std::uint64_t& total = counts_[reason];
-    if (total == 0) warn(detail);
-    total += n;
-  }
+  void count(const std::string& reason, const std::string& detail, std::uint64_t n = 1);
   /// Adds up without a word.
-  void add(const std::string& reason, std::uint64_t n) {
-    if (n > 0) counts_[reason] += n;
-  }
-  static void warn(const std::string& text) {
-    std::fprintf(stderr, "fuse_bag: warning: %s\n", text.c_str());
-  }
-  static void note(const std::string& text) {
-    std::fprintf(stderr, "fuse_bag: note: %s\n", text.c_str());
-  }
-  const std::map<std::string, std::uint64_t>& counts() const { return counts_; }
+  void add(const std::string& reason, std::uint64_t n);
+  std::map<std::string, std::uint64_t> counts() const;
+
+  /// Lines for the user; the program tells each once.
+  static void warn(const std::string& text);
+  static void note(const std::string& text);
 
  private:
+  mutable std::mutex mutex_;
   std::map<std::string, std::uint64_t> counts_;
 };
 

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: MIT
 /// fuse_bag: the whole pipeline offline. See kFuseBagUsage.
+#include <malloc.h>
 #include <sys/stat.h>
 
 #include <cstdio>
@@ -22,16 +23,31 @@ bool sameFile(const std::string& a, const std::string& b) {
   return status_a.st_dev == status_b.st_dev && status_a.st_ino == status_b.st_ino;
 }
 
+/// Images come and go by the second. Without this the C library gives the memory of each back to
+/// the system and gets it anew, which takes a seventh of the time.
+void reuseMemory() {
+#ifdef __GLIBC__
+  constexpr int kLargest = 32 << 20;  // the most that it takes for the first
+  ::mallopt(M_MMAP_THRESHOLD, kLargest);
+  ::mallopt(M_TRIM_THRESHOLD, 4 * kLargest);
+  ::mallopt(M_ARENA_MAX, 2);
+#endif
+}
+
 void fuse(const FuseBagOptions& options) {
   if (options.print_rig) {
-    printText(configurationText(loadRig(options.rig, options.overrides)));
+    printText(configurationText(loadRig(options.rig, options.outputs.front().overrides)));
     return;
   }
-  for (const std::string& input : options.inputs) {
-    if (sameFile(input, options.output)) {
-      throw Error(options.output + ": is the input bag itself");
+  for (auto output = options.outputs.begin(); output != options.outputs.end(); ++output) {
+    for (const std::string& input : options.inputs) {
+      if (sameFile(input, output->path)) throw Error(output->path + ": is the input bag itself");
+    }
+    for (auto other = options.outputs.begin(); other != output; ++other) {
+      if (sameFile(other->path, output->path)) throw Error(output->path + ": is given twice");
     }
   }
+  reuseMemory();
   BagFusion fusion(options, endIfInterrupted);
   fusion.run();
   if (!options.quiet) std::fputs(fusion.summary().c_str(), stdout);

@@ -1,7 +1,18 @@
 // SPDX-License-Identifier: MIT
 #include "tools/fuse_bag/fuse_bag_options.h"
 
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <thread>
+
 namespace semantic_lidar_fusion {
+namespace {
+
+constexpr unsigned kMostJobs = 64;
+constexpr double kLongestBagS = 1e9;
+
+}  // namespace
 
 const char kFuseBagUsage[] =
     R"(usage: fuse_bag IN.bag [IN.bag ...] OUT.bag --rig FILE [options]
@@ -13,7 +24,8 @@ as fast as the machine allows. The same input gives the same bytes.
   IN.bag           lidar, camera_info, tf (or odometry), images and scores; several bags are one
                    drive (rosbag record --split, images or tf_static apart)
   OUT.bag          /scan_reference, /points_compensated, /points_semantic, /class_info,
-                   /configuration (the rig as used) and for each camera /<camera>/selection
+                   /configuration (the rig as used) and for each camera /<camera>/selection,
+                   LZ4-compressed
 
 options:
   --rig FILE       the rig file (see config/usyd.yaml)
@@ -23,6 +35,15 @@ options:
   --tf             also copy /tf and /tf_static to OUT.bag
   --truth visibility
                    let the bag's /points_truth, and no mask, say which camera sees which point
+  --also OUT2.bag  make a second output, and so on: the options --set and --truth behind it are its
+                   own, those before it are not. Outputs that differ in what comes after the images
+                   (motion, odometry.lookup, on_missing and max_extrapolation, uncertainty,
+                   occlusion, overlap, smoothing, keep_unlabelled) share the work on the bag and its
+                   images
+  --start S        fuse the scans recorded from S seconds after the first message on
+  --end S          fuse the scans recorded before S seconds after the first message
+  --jobs N         threads, 1 to 64 (default: one for each processor); no effect on the result
+  --uncompressed   write OUT.bag without compression
   --force          replace OUT.bag whatever it is; without, an earlier output only
   --quiet          no progress and no summary
   --print-rig      print the rig file with --set applied and every default filled in, and end; the
@@ -37,14 +58,27 @@ the rig has cameras; 2 wrong command line.
 FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
   FuseBagOptions options;
   OptionReader reader(&options);
+  double end_s = std::numeric_limits<double>::infinity();
   reader.text("--rig", &options.rig);
   reader.value("--set", [&](const std::string& value) {
     if (value.find('=') == std::string::npos) {
       throw UsageError("--set " + value + ": KEY=VALUE is wanted");
     }
-    options.overrides.push_back(value);
+    options.outputs.back().overrides.push_back(value);
   });
-  reader.choice<bool>("--truth", {{"visibility", true}}, &options.true_visibility);
+  reader.value("--truth", [&](const std::string& value) {
+    if (value != "visibility")
+      throw UsageError("--truth is '" + value + "'; it must be visibility");
+    options.outputs.back().true_visibility = true;
+  });
+  reader.value("--also", [&](const std::string& value) {
+    if (value.empty()) throw UsageError("--also needs the name of a bag");
+    options.outputs.push_back({value, {}, false});
+  });
+  reader.number("--start", 0.0, kLongestBagS, &options.start_s);
+  reader.number("--end", 0.0, kLongestBagS, &end_s);
+  reader.wholeNumber("--jobs", 1, kMostJobs, &options.jobs);
+  reader.flag("--uncompressed", &options.uncompressed);
   reader.flag("--all", &options.all);
   reader.flag("--tf", &options.tf);
   reader.flag("--print-rig", &options.print_rig);
@@ -61,7 +95,12 @@ FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
     throw UsageError("IN.bag and OUT.bag are wanted; " + std::to_string(files.size()) +
                      " file name" + (files.size() == 1 ? " was" : "s were") + " given");
   }
-  options.output = files.back();
+  if (std::isfinite(end_s)) options.end_s = end_s;
+  if (options.start_s >= end_s) throw UsageError("--start must come before --end");
+  if (options.jobs == 0) {
+    options.jobs = static_cast<int>(std::clamp(std::thread::hardware_concurrency(), 1u, kMostJobs));
+  }
+  options.outputs.front().path = files.back();
   files.pop_back();
   options.inputs = files;
   return options;

@@ -1,9 +1,7 @@
 // SPDX-License-Identifier: MIT
 #include "tools/fuse_bag/image_source.h"
 
-#include <sensor_msgs/CompressedImage.h>
-#include <sensor_msgs/Image.h>
-
+#include <algorithm>
 #include <utility>
 
 #include "edge/conversions.h"
@@ -23,90 +21,100 @@ void checkSize(const SegmentedImage& image, const ImageSize& wanted) {
   }
 }
 
+/// The image with its pixels, from its messages. `owner` keeps what it refers to.
+std::shared_ptr<SegmentedImage> decoded(const ImageTask& task) {
+  auto result = std::make_shared<SegmentedImage>();
+  result->stamp = task.stamp;
+  if (task.file) result->image = decodedImage(*task.file);
+  if (task.pixels) result->image = colorImage(task.pixels);
+  if (task.semantics) result->input = pixelView(*task.semantics);
+  using Messages = std::pair<sensor_msgs::ImageConstPtr, sensor_msgs::ImageConstPtr>;
+  result->owner = std::make_shared<const Messages>(task.pixels, task.semantics);
+  return result;
+}
+
 }  // namespace
 
-ImageSource::ImageSource(const Rig& rig, const DriveIndex& index, ScanPipeline* pipeline,
-                         DropLog* drops,
-                         std::function<void(std::size_t, const SegmentedImage&)> segmented,
-                         std::function<void(const std::string&)> note)
+ImageSource::ImageSource(const Rig& rig, const DriveIndex& index, bool keep_pixels)
     : rig_(rig),
       index_(index),
-      pipeline_(*pipeline),
-      drops_(*drops),
-      segmented_(std::move(segmented)),
-      note_(std::move(note)),
+      keep_pixels_(keep_pixels),
+      pipeline_(rig, {PipelineStep::kNetwork, PipelineStep::kSegment}),
       recent_(rig.cameras.size()) {}
 
-std::map<StampNs, StampNs> ImageSource::candidates(std::size_t camera) const {
-  const CameraTrack& track = index_.cameras[camera];
-  const CameraConfig& config = rig_.cameras[camera];
-  const bool made_on_request = !track.has_semantics && config.input == CameraInput::kScores &&
-                               !rig_.segmentation.model.empty();
-  std::map<StampNs, StampNs> result;
-  for (const MessagesByStamp* messages : {&track.images, &track.semantics}) {
-    for (const auto& message : *messages) {
-      const StampNs stamp = message.first;
-      const ImageParts parts{track.images.count(stamp) > 0, track.semantics.count(stamp) > 0};
-      if (!isCandidate(config.input, parts, made_on_request)) continue;
-      result[pipeline_.imageTime(camera, stamp)] = stamp;
-    }
-  }
-  return result;
+bool ImageSource::networkMakesScores(std::size_t camera) const {
+  return !index_.cameras[camera].has_semantics && !rig_.segmentation.model.empty() &&
+         rig_.cameras[camera].input == CameraInput::kScores;
 }
 
-std::shared_ptr<const SegmentedImage> ImageSource::image(std::size_t camera, StampNs stamp,
-                                                         const ImageSize& size) {
+bool ImageSource::isCandidate(std::size_t camera, StampNs stamp) const {
+  const CameraTrack& track = index_.cameras[camera];
+  const ImageParts parts{track.images.count(stamp) > 0, track.semantics.count(stamp) > 0};
+  return semantic_lidar_fusion::isCandidate(rig_.cameras[camera].input, parts,
+                                            networkMakesScores(camera));
+}
+
+std::shared_ptr<ImageTask> ImageSource::find(std::size_t camera, StampNs stamp,
+                                             const ImageSize& size, bool* is_new) {
   auto& recent = recent_[camera];
-  for (const auto& image : recent) {
-    if (image->stamp == stamp) return image;
-  }
+  const auto known =
+      std::find_if(recent.begin(), recent.end(), [&](const std::shared_ptr<ImageTask>& task) {
+        return task->stamp == stamp && task->size == size;
+      });
+  *is_new = known == recent.end();
+  if (!*is_new) return *known;
+  auto task = std::make_shared<ImageTask>();
+  task->camera = camera;
+  task->stamp = stamp;
+  task->size = size;
+  const CameraTrack& track = index_.cameras[camera];
+  if (!track.infos.empty()) task->frame_id = track.infos.front().second.frame_id;
   try {
-    const std::shared_ptr<SegmentedImage> image = load(camera, stamp);
-    checkSize(*image, size);
-    pipeline_.segment(camera, image.get());
-    if (!image->note.empty() && told_notes_.insert(image->note).second) note_(image->note);
-    segmented_(camera, *image);
-    recent.push_back(image);
-    if (recent.size() > kRecentImages) recent.pop_front();
-    return image;
+    const auto image = track.images.find(stamp);
+    if (image != track.images.end()) {
+      if (rig_.cameras[camera].transport == ImageTransport::kCompressed) {
+        task->file = image->second.file();
+      } else {
+        task->pixels = image->second.pixels();
+      }
+    }
+    const auto semantics = track.semantics.find(stamp);
+    if (semantics != track.semantics.end()) task->semantics = semantics->second.pixels();
   } catch (const DataError& e) {
-    drops_.count("camera " + rig_.cameras[camera].name + ": unusable images or scores",
-                 "camera " + rig_.cameras[camera].name + ", image " + std::to_string(stamp) +
-                     " ns: " + e.what());
-    return nullptr;
+    task->failure = e.what();
   }
+  recent.push_back(task);
+  if (recent.size() > kRecentImages) recent.pop_front();
+  return task;
 }
 
-std::shared_ptr<SegmentedImage> ImageSource::load(std::size_t camera, StampNs stamp) const {
-  const CameraTrack& track = index_.cameras[camera];
-  const CameraConfig& config = rig_.cameras[camera];
-  // The pixel views below point into these messages.
-  struct Messages {
-    sensor_msgs::ImageConstPtr image, semantics;
-  };
-  auto messages = std::make_shared<Messages>();
-  auto result = std::make_shared<SegmentedImage>();
-  result->stamp = stamp;
-  result->owner = messages;
-  const auto image = track.images.find(stamp);
-  if (image != track.images.end()) {
-    if (config.transport == ImageTransport::kCompressed) {
-      const auto compressed = image->second.instantiate<sensor_msgs::CompressedImage>();
-      if (!compressed) throw DataError("has another definition of sensor_msgs/CompressedImage");
-      result->image = decodedImage(*compressed);
-    } else {
-      messages->image = image->second.instantiate<sensor_msgs::Image>();
-      if (!messages->image) throw DataError("has another definition of sensor_msgs/Image");
-      result->image = colorImage(messages->image);
+void ImageSource::make(ImageTask* task) {
+  if (!task->failure.empty()) return;
+  try {
+    const std::shared_ptr<SegmentedImage> image = decoded(*task);
+    checkSize(*image, task->size);
+    pipeline_.segment(task->camera, image.get());
+    if (!keep_pixels_) {
+      image->image.release();
+      image->superpixels = SuperpixelMap();
+      image->owner = std::make_shared<const sensor_msgs::ImageConstPtr>(task->semantics);
     }
+    task->image = image;
+  } catch (const DataError& e) {
+    task->failure = e.what();
   }
-  const auto semantics = track.semantics.find(stamp);
-  if (semantics != track.semantics.end()) {
-    messages->semantics = semantics->second.instantiate<sensor_msgs::Image>();
-    if (!messages->semantics) throw DataError("has another definition of sensor_msgs/Image");
-    result->input = pixelView(*messages->semantics);
-  }
-  return result;
+  task->file.reset();
+  task->pixels.reset();
+  task->semantics.reset();
+}
+
+/// The network serves one image at a time.
+std::size_t ImageSource::lineCount() const {
+  return rig_.segmentation.model.empty() ? rig_.cameras.size() : 1;
+}
+
+std::size_t ImageSource::lineOf(std::size_t camera) const {
+  return rig_.segmentation.model.empty() ? camera : 0;
 }
 
 }  // namespace semantic_lidar_fusion

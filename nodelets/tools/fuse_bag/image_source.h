@@ -4,49 +4,62 @@
 
 #include <cstddef>
 #include <deque>
-#include <functional>
-#include <map>
 #include <memory>
-#include <set>
 #include <string>
 #include <vector>
 
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
-#include "tools/fuse_bag/drive_index.h"
-#include "tools/fuse_bag/drop_log.h"
+#include "tools/fuse_bag/drive_reader.h"
 
 namespace semantic_lidar_fusion {
 
+/// An image on its way: asked for, then made in another thread.
+struct ImageTask {
+  std::size_t camera = 0;
+  StampNs stamp = 0;  ///< raw
+  ImageSize size;     ///< what camera_info says
+  std::string frame_id;
+  sensor_msgs::CompressedImageConstPtr file;
+  sensor_msgs::ImageConstPtr pixels, semantics;
+
+  /// What has come of it: the image, or why there is none.
+  std::shared_ptr<const SegmentedImage> image;
+  std::string failure;
+  bool is_made = false;
+};
+
 class ImageSource {
  public:
-  /// Keeps the references. `segmented` is told each image that was segmented, once; `note` what a
-  /// user should know of its superpixels, once.
-  ImageSource(const Rig& rig, const DriveIndex& index, ScanPipeline* pipeline, DropLog* drops,
-              std::function<void(std::size_t camera, const SegmentedImage&)> segmented,
-              std::function<void(const std::string&)> note);
+  /// Keeps the references. `keep_pixels`: images keep what only pictures of them need.
+  ImageSource(const Rig& rig, const DriveIndex& index, bool keep_pixels);
 
-  /// The images of a camera that can be chosen: raw stamps by true time. Where the bag has no
-  /// scores of the camera, the rig's network makes them.
-  std::map<StampNs, StampNs> candidates(std::size_t camera) const;
+  /// Whether an image of a camera can be chosen. Where the bag has no scores of the camera, the
+  /// rig's network makes them.
+  bool isCandidate(std::size_t camera, StampNs stamp) const;
 
-  /// An image of the bag, segmented; null, counted and told if it is unusable. Images of one camera
-  /// are asked for in order of time. `size`: what camera_info says.
-  std::shared_ptr<const SegmentedImage> image(std::size_t camera, StampNs stamp,
-                                              const ImageSize& size);
+  /// Finds the messages of an image; `is_new` is false if it was asked for lately. Images of one
+  /// camera are asked for in order of time.
+  std::shared_ptr<ImageTask> find(std::size_t camera, StampNs stamp, const ImageSize& size,
+                                  bool* is_new);
+
+  /// Decodes and segments. The images of one line come in the order in which they were asked for,
+  /// those of different lines side by side.
+  void make(ImageTask* task);
+  std::size_t lineCount() const;
+  std::size_t lineOf(std::size_t camera) const;
+
+  const ScanPipeline& pipeline() const { return pipeline_; }
 
  private:
-  std::shared_ptr<SegmentedImage> load(std::size_t camera, StampNs stamp) const;
+  bool networkMakesScores(std::size_t camera) const;
 
   const Rig& rig_;
   const DriveIndex& index_;
-  ScanPipeline& pipeline_;
-  DropLog& drops_;
-  std::function<void(std::size_t, const SegmentedImage&)> segmented_;
-  std::function<void(const std::string&)> note_;
-  std::set<std::string> told_notes_;
+  bool keep_pixels_;
+  ScanPipeline pipeline_;
   /// By camera: one image may serve two scans.
-  std::vector<std::deque<std::shared_ptr<const SegmentedImage>>> recent_;
+  std::vector<std::deque<std::shared_ptr<ImageTask>>> recent_;
 };
 
 }  // namespace semantic_lidar_fusion

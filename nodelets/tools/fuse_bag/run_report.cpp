@@ -33,7 +33,8 @@ std::string RunReport::commonestStatus() const {
          kPointStatusNames[static_cast<std::size_t>(most - by_status_.begin())];
 }
 
-std::string RunReport::text(const Input& input, const DropLog& drops) const {
+std::string RunReport::text(const Input& input,
+                            const std::map<std::string, std::uint64_t>& drops) const {
   std::string text = input.output + ": " + count(scans_, "scan") + " of " +
                      std::to_string(input.scans) + ", " + count(points_, "point") + " (";
   for (std::size_t s = 0; s < by_status_.size(); ++s) {
@@ -53,8 +54,8 @@ std::string RunReport::text(const Input& input, const DropLog& drops) const {
             std::to_string(input.cameras[c].scores) + " of scores in the bag\n";
   }
   if (!input.time_decision.empty()) text += "  " + input.time_decision + "\n";
-  if (drops.counts().empty()) text += "  nothing was dropped\n";
-  for (const auto& drop : drops.counts()) {
+  if (drops.empty()) text += "  nothing was dropped\n";
+  for (const auto& drop : drops) {
     text += "  counted: " + drop.first + ": " + std::to_string(drop.second) + "\n";
   }
   const double seconds =

@@ -6,11 +6,11 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <map>
 #include <string>
 #include <vector>
 
 #include "semantic_lidar_fusion/common/point_cloud.h"
-#include "tools/fuse_bag/drop_log.h"
 
 namespace semantic_lidar_fusion {
 
@@ -48,7 +48,7 @@ class RunReport {
   /// "100.0 % of 8000 points: no odometry": what stands in the way of most points.
   std::string commonestStatus() const;
 
-  std::string text(const Input& input, const DropLog& drops) const;
+  std::string text(const Input& input, const std::map<std::string, std::uint64_t>& drops) const;
 
  private:
   std::chrono::steady_clock::time_point started_ = std::chrono::steady_clock::now();

@@ -5,20 +5,33 @@
 
 #include <algorithm>
 #include <limits>
-#include <set>
 #include <utility>
 
 #include "edge/velodyne_messages.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {
+namespace {
 
-ScanSource::ScanSource(const Rig& rig, DropLog* drops)
+/// Of scans that wait for their decision, so many keep their points.
+constexpr std::size_t kMostWithPoints = 64;
+
+}  // namespace
+
+ScanSource::ScanSource(const Rig& rig, const DriveIndex& index, const ImageSource& images,
+                       CameraPlaces* places, DropLog* drops)
     : rig_(rig),
+      index_(index),
+      images_(images),
+      places_(*places),
       drops_(*drops),
-      lidar_(rig.lidar, [this](const std::string& reason, std::uint64_t n) {
-        if (counts_points_) drops_.add("lidar: " + reason, n);
-      }) {}
+      lidar_(rig.lidar,
+             [this](const std::string& reason, std::uint64_t n) {
+               if (counts_points_) drops_.add("lidar: " + reason, n);
+             }),
+      selection_(rig.selectorConfig()) {
+  selection_.image_history_ns = std::numeric_limits<StampNs>::max() / 4;
+}
 
 TimedCloud ScanSource::decode(const rosbag::MessageInstance& message) {
   if (rig_.lidar.input == LidarInput::kPackets) {
@@ -31,78 +44,81 @@ TimedCloud ScanSource::decode(const rosbag::MessageInstance& message) {
   return lidar_.decode(*cloud);
 }
 
-void ScanSource::measure(const std::vector<rosbag::MessageInstance>& messages, const Place& place,
-                         const std::function<void()>& advanced) {
-  const bool sweeps = rig_.image_choice == ImageChoice::kClosestToSweep;
-  for (const rosbag::MessageInstance& message : messages) {
-    BagScan scan;
-    scan.message = &message;
-    scan.image_stamps.resize(rig_.cameras.size());
-    try {
-      const TimedCloud cloud = decode(message);
-      scan.times.interval = scanInterval(cloud);
-      scan.empty = cloud.empty();
-      scan.usable = true;
-      if (scan.times.interval.first_ns <= 0) throw DataError("has stamp 0");
-      if (cloud.frame_id.empty()) throw DataError("has an empty frame_id");
-      for (std::size_t c = 0; sweeps && c < rig_.cameras.size(); ++c) {
-        const CameraPlace at = place(c, message.getTime(), cloud.frame_id);
-        scan.times.sweep_ns.push_back(sweepTime(cloud, at));
-      }
-    } catch (const DataError& e) {
-      scan.usable = false;
-      drops_.count("scans: unusable", message.getTopic() + ": scan " +
-                                          std::to_string(scans_.size()) +
-                                          " is dropped: " + e.what());
-    }
-    scans_.push_back(std::move(scan));
-    advanced();
+void ScanSource::take(const rosbag::MessageInstance& message) {
+  BagScan scan(message);
+  scan.number = taken_++;
+  scan.image_stamps.resize(rig_.cameras.size());
+  try {
+    TimedCloud cloud = decode(message);
+    scan.times.interval = scanInterval(cloud);
+    scan.empty = cloud.empty();
+    if (scan.times.interval.first_ns <= 0) throw DataError("has stamp 0");
+    if (cloud.frame_id.empty()) throw DataError("has an empty frame_id");
+    if (waiting_.size() < kMostWithPoints) scan.points = std::move(cloud);
+  } catch (const DataError& e) {
+    drops_.count("scans: unusable", message.getTopic() + ": scan " + std::to_string(scan.number) +
+                                        " is dropped: " + e.what());
+    return;
+  }
+  const StampNs first_ns = scan.times.interval.first_ns;
+  if (!seen_.insert(first_ns).second) {
+    drops_.count("scans: first point seen twice", "second scan with its first point at " +
+                                                      std::to_string(first_ns) + " ns is dropped");
+    return;
+  }
+  waiting_.push_back(std::move(scan));
+}
+
+TimedCloud ScanSource::points(BagScan* scan) {
+  if (scan->points) {
+    TimedCloud points = std::move(*scan->points);
+    scan->points.reset();
+    return points;
   }
   counts_points_ = false;
-  for (const LidarDecoder::Note& note : lidar_.takeNotes()) {
-    if (note.warning) {
-      DropLog::warn("lidar: " + note.text);
-    } else if (note.text != lidar_.timeDecision()) {  // which the summary tells
-      DropLog::note("lidar: " + note.text);
-    }
-  }
+  TimedCloud points = decode(scan->message);
+  counts_points_ = true;
+  return points;
 }
 
-void ScanSource::select(const Candidates& candidates) {
-  SelectorConfig config = rig_.selectorConfig();
-  config.image_history_ns = std::numeric_limits<StampNs>::max() / 4;
-  std::set<StampNs> seen;
-  for (BagScan& scan : scans_) {
-    if (!scan.usable) continue;
-    const StampNs first_ns = scan.times.interval.first_ns;
-    if (!seen.insert(first_ns).second) {
-      scan.usable = false;
-      drops_.count(
-          "scans: first point seen twice",
-          "second scan with its first point at " + std::to_string(first_ns) + " ns is dropped");
-    } else if (scan.empty) {  // no time to choose by: stamped with its header
-      scan.reference_ns = first_ns;
-    } else {
-      decide(config, candidates, &scan);
-    }
+BagScan ScanSource::decide() {
+  BagScan scan = std::move(waiting_.front());
+  waiting_.pop_front();
+  if (scan.empty) {  // no time to choose by: stamped with its header
+    scan.reference_ns = scan.times.interval.first_ns;
+    return scan;
   }
+  if (rig_.image_choice == ImageChoice::kClosestToSweep) {
+    const TimedCloud points = this->points(&scan);
+    for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
+      const CameraPlace at = places_.at(c, scan.message.getTime(), points.frame_id);
+      scan.times.sweep_ns.push_back(sweepTime(points, at));
+    }
+    scan.points = points;
+  }
+  select(&scan);
+  return scan;
 }
 
-void ScanSource::decide(const SelectorConfig& config, const Candidates& candidates,
-                        BagScan* scan) const {
-  StampNs reach_ns = config.reference_timeout_ns;
-  for (const SelectorCamera& camera : config.cameras) {
+void ScanSource::select(BagScan* scan) const {
+  StampNs reach_ns = selection_.reference_timeout_ns;
+  for (const SelectorCamera& camera : selection_.cameras) {
     reach_ns = std::max(reach_ns, camera.max_time_difference_ns);
   }
   const ScanInterval& interval = scan->times.interval;
-  ScanSelector selector(config);
+  ScanSelector selector(selection_);
   selector.addScan(scan->times, 0);
   // t_ref is at most `reach_ns` off the scan, an image at most that off t_ref.
-  for (std::size_t c = 0; c < candidates.size(); ++c) {
-    for (auto image = candidates[c].lower_bound(interval.first_ns - 2 * reach_ns);
-         image != candidates[c].end() && image->first <= interval.last_ns + 2 * reach_ns; ++image) {
-      selector.addImage(static_cast<int>(c), image->second);
+  for (std::size_t c = 0; c < index_.cameras.size(); ++c) {
+    const StampNs begin = interval.first_ns - 2 * reach_ns - images_.pipeline().imageTime(c, 0);
+    const StampNs end = interval.last_ns + 2 * reach_ns - images_.pipeline().imageTime(c, 0);
+    std::set<StampNs> stamps;
+    for (const ImagesByStamp* images : {&index_.cameras[c].images, &index_.cameras[c].semantics}) {
+      for (auto i = images->lower_bound(begin); i != images->end() && i->first <= end; ++i) {
+        if (images_.isCandidate(c, i->first)) stamps.insert(i->first);
+      }
     }
+    for (const StampNs stamp : stamps) selector.addImage(static_cast<int>(c), stamp);
   }
   const SelectorDecisions decisions = selector.finish();
   for (const ReferenceDecision& decision : decisions.references) {
@@ -110,6 +126,23 @@ void ScanSource::decide(const SelectorConfig& config, const Candidates& candidat
   }
   for (const SelectionDecision& decision : decisions.selections) {
     scan->image_stamps[static_cast<std::size_t>(decision.camera)] = decision.image_stamp;
+  }
+}
+
+bool ScanSource::holds(const BagScan& scan) const {
+  if (scan.empty) return true;
+  BagScan again = scan;
+  select(&again);
+  return again.reference_ns == scan.reference_ns && again.image_stamps == scan.image_stamps;
+}
+
+void ScanSource::tellNotes() {
+  for (const LidarDecoder::Note& note : lidar_.takeNotes()) {
+    if (note.warning) {
+      DropLog::warn("lidar: " + note.text);
+    } else if (note.text != lidar_.timeDecision()) {  // which the summary tells
+      DropLog::note("lidar: " + note.text);
+    }
   }
 }
 

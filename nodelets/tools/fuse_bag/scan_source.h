@@ -4,64 +4,75 @@
 #pragma once
 
 #include <cstddef>
-#include <functional>
-#include <map>
+#include <cstdint>
+#include <deque>
 #include <optional>
+#include <set>
 #include <string>
 #include <vector>
 
 #include "edge/lidar_decoder.h"
 #include "semantic_lidar_fusion/config/rig.h"
-#include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
-#include "tools/fuse_bag/drive_index.h"
+#include "tools/fuse_bag/camera_places.h"
+#include "tools/fuse_bag/drive_reader.h"
 #include "tools/fuse_bag/drop_log.h"
+#include "tools/fuse_bag/image_source.h"
 
 namespace semantic_lidar_fusion {
 
 /// One scan of the bag.
 struct BagScan {
-  const rosbag::MessageInstance* message = nullptr;
+  explicit BagScan(rosbag::MessageInstance place) : message(std::move(place)) {}
+
+  rosbag::MessageInstance message;
+  std::size_t number = 0;  ///< in the bag
   SelectorScan times;
-  bool usable = false;
   bool empty = false;
+  std::optional<TimedCloud> points;  ///< as long as few scans wait; else they are decoded again
   StampNs reference_ns = 0;
-  std::vector<std::optional<StampNs>> image_stamps;  ///< raw, per camera
+  std::vector<std::optional<StampNs>> image_stamps;  ///< raw, by camera
 };
 
 class ScanSource {
  public:
-  /// Where a camera stands at the time of a message, in the frame of a lidar.
-  using Place = std::function<CameraPlace(std::size_t camera, const ros::Time& time,
-                                          const std::string& lidar_frame)>;
-  /// Of each camera the raw stamps of the images that can be chosen, by true time.
-  using Candidates = std::vector<std::map<StampNs, StampNs>>;
-
   /// Keeps the references.
-  ScanSource(const Rig& rig, DropLog* drops);
+  ScanSource(const Rig& rig, const DriveIndex& index, const ImageSource& images,
+             CameraPlaces* places, DropLog* drops);
 
-  /// Throws DataError.
-  TimedCloud decode(const rosbag::MessageInstance& message);
-  /// Decodes each scan for its times; its points are decoded again when it is fused, which costs
-  /// less than keeping them. `advanced` is called after each.
-  void measure(const std::vector<rosbag::MessageInstance>& messages, const Place& place,
-               const std::function<void()>& advanced);
-  /// Each scan is decided with all stamps that may matter to it, as if nothing more would come: the
-  /// selector's bounds on memory and its timeouts, made for a live stream, do not touch the result.
-  void select(const Candidates& candidates);
+  /// The next scan of the bag: decoded for its times. One that cannot be used is counted.
+  void take(const rosbag::MessageInstance& message);
+  /// The oldest scan that was taken and not decided; null if there is none.
+  const BagScan* waiting() const { return waiting_.empty() ? nullptr : &waiting_.front(); }
+  /// Decides it with all stamps that are known, as if nothing more would come: the selector's
+  /// bounds on memory and its timeouts, made for a live stream, do not touch the result.
+  BagScan decide();
+  /// The points of a scan, which it gives away. Throws DataError.
+  TimedCloud points(BagScan* scan);
+  /// Whether the images of a scan that was decided are still those that it would get.
+  bool holds(const BagScan& scan) const;
 
-  const std::vector<BagScan>& scans() const { return scans_; }
+  std::size_t taken() const { return taken_; }
   /// How the times of points are understood; empty for packets.
   const std::string& timeDecision() const { return lidar_.timeDecision(); }
+  /// What a user should know of the lidar's messages.
+  void tellNotes();
 
  private:
-  void decide(const SelectorConfig& config, const Candidates& candidates, BagScan* scan) const;
+  TimedCloud decode(const rosbag::MessageInstance& message);
+  void select(BagScan* scan) const;
 
   const Rig& rig_;
+  const DriveIndex& index_;
+  const ImageSource& images_;
+  CameraPlaces& places_;
   DropLog& drops_;
-  bool counts_points_ = true;  ///< scans are decoded twice, their points are counted once
+  bool counts_points_ = true;  ///< scans may be decoded twice, their points are counted once
   LidarDecoder lidar_;
-  std::vector<BagScan> scans_;
+  SelectorConfig selection_;
+  std::size_t taken_ = 0;
+  std::set<StampNs> seen_;  ///< first points
+  std::deque<BagScan> waiting_;
 };
 
 }  // namespace semantic_lidar_fusion
