@@ -4,6 +4,7 @@
 #include <utility>
 
 #include "beam_steps.h"
+#include "ground_plane.h"
 #include "range_image.h"
 #include "semantic_lidar_fusion/common/thread_pool.h"
 #include "surface_linker.h"
@@ -46,6 +47,7 @@ BeamGrid beamGrid(const Cloud& cloud, const OcclusionConfig& config, ThreadPool*
     measureSteps(image, config, pool, &grid);
     if (with_links) {
       grid.links = linksOfCloud(image, linkSurfaces(image, config, grid, pool), cloud.size(), pool);
+      grid.ground = groundPlane(image, grid);
       grid.ring = std::move(image.row_of);
       grid.note = std::move(image.note);
     }

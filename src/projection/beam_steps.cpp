@@ -121,6 +121,7 @@ void measureGaps(const std::vector<std::vector<int>>& turns, double given_step_r
     for (std::size_t i = 0; i < upwards.size(); ++i) {
       BeamGrid::Ring& ring = grid->rings[upwards[i]];
       const bool lowest = i == 0, highest = i + 1 == upwards.size();
+      ring.lowest = lowest;
       if (lowest && highest) {
         ring.half_up_rad = ring.half_down_rad = 0.5 * grid->vertical_step_rad;
       } else {

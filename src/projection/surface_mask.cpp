@@ -22,6 +22,9 @@ constexpr float kEdgeReach = 0.75f;
 /// The same, up and down, for a return that continues on neither side: often a level surface seen
 /// edge-on (a roof), of which a tall mask would be wrong; and to all sides for one on no surface.
 constexpr float kLoneReach = 0.5f;
+/// A return of the lowest ring that is higher above the ground than this (m) is no ground: twice
+/// what uneven ground and range noise add up to.
+constexpr float kStands_m = 0.3f;
 
 /// The points in the image, tile by tile, with the farthest of each tile: most surfaces have
 /// nothing behind them.
@@ -237,7 +240,20 @@ class SurfaceMasks {
     add(links.left, links.right, kMaskLeft, wide, 0.0f);
     add(links.right, links.left, kMaskRight, -wide, 0.0f);
     add(links.up, links.down, kMaskUp, 0.0f, high);
-    add(links.down, links.up, kMaskDown, 0.0f, -low);
+    if (links.down == kNone && standsOnGround(self, ring)) {
+      openArm(point(self) - heightAboveGround(self) * grid_.ground->normal, kMaskDown, 1.0f);
+    } else {
+      add(links.down, links.up, kMaskDown, 0.0f, -low);
+    }
+  }
+
+  float heightAboveGround(std::int32_t self) const {
+    return grid_.ground->normal.dot(point(self)) + grid_.ground->offset_m;
+  }
+
+  /// Whether what the lowest ring hits reaches down to the ground, unseen by the lidar.
+  bool standsOnGround(std::int32_t self, const BeamGrid::Ring& ring) const {
+    return ring.lowest && grid_.ground && heightAboveGround(self) > kStands_m;
   }
 
   /// Half-way to a neighbour on the same surface.

@@ -3,7 +3,9 @@
 /// one surface.
 #pragma once
 
+#include <Eigen/Core>
 #include <cstdint>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -21,6 +23,12 @@ struct BeamGrid {
     double half_up_rad = 0;    ///< half-way to the next ring up
     double half_down_rad = 0;
     double half_azimuth_rad = 0;  ///< half the median azimuth step
+    bool lowest = false;          ///< nothing is measured below it
+  };
+  /// The ground as a plane: height above it = normal . p + offset.
+  struct Ground {
+    Eigen::Vector3f normal = Eigen::Vector3f::UnitZ();  ///< unit, up
+    float offset_m = 0;
   };
   /// Cloud indices of the neighbouring returns on the same surface; kNoLink = the surface ends.
   struct Links {
@@ -38,7 +46,8 @@ struct BeamGrid {
   /// links.
   std::vector<std::uint16_t> ring;
   std::vector<Links> links;
-  std::string note;  ///< what to tell a user, once; mostly empty
+  std::optional<Ground> ground;  ///< with links, where the lowest rings show one
+  std::string note;              ///< what to tell a user, once; mostly empty
 };
 
 /// A scan of several turns of the lidar (more than a turn and a quarter, or a part of a turn again)

@@ -5,7 +5,9 @@
 /// in between. Towards a neighbour on another surface, or none, the surface ends somewhere between
 /// the two beams: the mask reaches three quarters of the way, straight on from the neighbour on the
 /// opposite side, or else at the point's range; half of the way up and down if it has a neighbour
-/// on its surface neither above nor below, and to all sides if it has none at all. Two returns lie
+/// on its surface neither above nor below, and to all sides if it has none at all. A return of the
+/// lowest ring that stands above the ground reaches down to it: the lower bodies of cars, which no
+/// beam meets. Two returns lie
 /// on one surface if their ranges are close, or (ground at a grazing angle) if the surface goes on
 /// straight; returns that are missing between them (glass, dark paint) are bridged. A point is
 /// hidden iff d > d_near + max(depth_margin_m, depth_margin_ratio * d_near), d_near = the nearest

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
+#include <optional>
 #include <random>
 
 #include "ray_scene.h"
@@ -457,7 +458,9 @@ class AdaptiveReference {
       const Image left = end(i, links.left, links.right, wide * ring.half_azimuth_rad, 0.0);
       const Image right = end(i, links.right, links.left, -wide * ring.half_azimuth_rad, 0.0);
       const Image up = end(i, links.up, links.down, 0.0, tall * ring.half_up_rad);
-      const Image down = end(i, links.down, links.up, 0.0, -tall * ring.half_down_rad);
+      const Image down =
+          foot(i, links, ring, grid)
+              .value_or(end(i, links.down, links.up, 0.0, -tall * ring.half_down_rad));
       addPatch(own, left, right, up);
       addPatch(own, left, right, down);
     }
@@ -521,6 +524,22 @@ class AdaptiveReference {
     return image(
         Eigen::Vector3d(std::cos(e) * std::cos(a), std::cos(e) * std::sin(a), std::sin(e)) /
         inverse);
+  }
+
+  /// Of what stands on the ground and is met by no lower ring.
+  std::optional<Image> foot(std::size_t i, const BeamGrid::Links& links, const BeamGrid::Ring& ring,
+                            const BeamGrid& grid) const {
+    if (links.down >= 0 || !grid.ground) return std::nullopt;
+    const BeamGrid::Ring* lowest = &ring;
+    for (const BeamGrid::Ring& other : grid.rings) {
+      if (other.half_azimuth_rad > 0 && other.elevation_rad < lowest->elevation_rad) {
+        return std::nullopt;
+      }
+    }
+    const Eigen::Vector3d normal = grid.ground->normal.cast<double>();
+    const double height = normal.dot(at(i)) + grid.ground->offset_m;
+    if (!(height > 0.3)) return std::nullopt;
+    return image(at(i) - height * normal);
   }
 
   void addPatch(const Image& own, const Image& left, const Image& right, const Image& end) {
@@ -633,6 +652,74 @@ TEST(AdaptiveMask, ABeamOnItsOwnCastsItsCell) {
   EXPECT_EQ(visiblePoints(cloud, points, T_camera_lidar, camera, grid, config)[2], 1);
   config.depth_margin_m = 0.4;
   EXPECT_EQ(visiblePoints(cloud, points, T_camera_lidar, camera, grid, config)[1], 0);
+}
+
+/// A van whose side the lowest ring meets 0.6 m above the ground, and a camera below the lidar: the
+/// wall's foot behind the van is hidden, though no beam meets what hides it.
+TEST(AdaptiveMask, WhatTheLowestRingMeetsStandsOnTheGround) {
+  const auto hiddenShare = [](bool with_ground) {
+    RayScene scene;
+    if (with_ground) scene.addGround(0.0);
+    scene.addBox({4.5, 0.0, 1.0}, {1.6, 3.0, 2.0}, 0.0);
+    const int wall = scene.addPanel(12.0, 8.0, 12.0, -8.0, 0.0, 3.0);
+    LidarPattern pattern = LidarPattern::vlp16(0.2);
+    const Transform T_world_lidar = lidarPose(1.6);
+    LidarScan scan = scanScene(scene, T_world_lidar, pattern, 1);
+    EXPECT_EQ(beamGrid(scan.cloud, mode(&OcclusionMode::kAdaptive)).ground.has_value(),
+              with_ground);
+    // What another sensor has seen of the wall below the van's side: beams of no ring.
+    const std::size_t measured = scan.cloud.size();
+    for (double y = -0.8; y <= 0.8; y += 0.1) {
+      for (double z = 0.1; z <= 0.35; z += 0.05) {
+        const Eigen::Vector3f p =
+            (T_world_lidar.inverse() * Eigen::Vector3d(12.0, y, z)).cast<float>();
+        scan.cloud.x.push_back(p.x());
+        scan.cloud.y.push_back(p.y());
+        scan.cloud.z.push_back(p.z());
+        scan.cloud.ring.push_back(kNoRing);
+        scan.cloud.status.push_back(0);
+      }
+    }
+    EXPECT_GE(wall, 0);
+    const Transform T_world_camera = cameraPose(0.6, 0.0, 0.0);
+    const Transform T_camera_lidar = T_world_camera.inverse() * T_world_lidar;
+    const CameraModel camera = referenceCamera();
+    const OcclusionConfig config = mode(&OcclusionMode::kAdaptive);
+    const BeamGrid grid = beamGrid(scan.cloud, config);
+    const ProjectedPoints points = projectCloud(scan.cloud, T_camera_lidar, camera, 0.0);
+    const auto visible = visiblePoints(scan.cloud, points, T_camera_lidar, camera, grid, config);
+    int hidden = 0, all = 0;
+    for (std::size_t i = 0; i < points.size(); ++i) {
+      if (points.index[i] < measured) continue;
+      ++all;
+      hidden += !visible[i];
+    }
+    EXPECT_GT(all, 80);
+    return static_cast<double>(hidden) / all;
+  };
+  EXPECT_GT(hiddenShare(true), 0.99);
+  EXPECT_LT(hiddenShare(false), 0.5);
+}
+
+TEST(BeamGrid, FindsTheGroundUnderALidarThatIsTilted) {
+  for (const double pitch_deg : {0.0, 6.0, -10.0}) {
+    RayScene scene = streetScene(4);
+    Transform T_world_lidar = lidarPose(1.9);
+    T_world_lidar.rotate(Eigen::AngleAxisd(radians(pitch_deg), Eigen::Vector3d::UnitY()));
+    const LidarScan scan = scanScene(scene, T_world_lidar, LidarPattern::vlp16(0.2), 4);
+    const BeamGrid grid = beamGrid(scan.cloud, mode(&OcclusionMode::kAdaptive));
+    ASSERT_TRUE(grid.ground);
+    const Eigen::Vector3d up = T_world_lidar.linear().transpose() * Eigen::Vector3d::UnitZ();
+    EXPECT_GT(grid.ground->normal.cast<double>().dot(up), std::cos(radians(1.5))) << pitch_deg;
+    EXPECT_NEAR(grid.ground->offset_m, 1.9, 0.1) << pitch_deg;
+  }
+}
+
+TEST(BeamGrid, FindsNoGroundWhereThereIsNone) {
+  RayScene scene;  // a wall in front of a lidar in the air
+  scene.addPanel(6.0, 8.0, 6.0, -8.0, -4.0, 4.0);
+  const LidarScan scan = scanScene(scene, Transform::Identity(), LidarPattern::vlp16(0.2), 1);
+  EXPECT_FALSE(beamGrid(scan.cloud, mode(&OcclusionMode::kAdaptive)).ground);
 }
 
 TEST(AdaptiveMask, PointsOutsideTheImageCastIntoIt) {
