@@ -13,8 +13,9 @@ from semantic_lidar_fusion import cli  # noqa: E402
 from semantic_lidar_fusion.maps import formats  # noqa: E402
 
 EPILOG = """\
-INPUT is a bag with points_semantic (and class_info), as fuse_bag writes it, or a map.voxels of an
-earlier run with the same options, which is added. Poses come from tf at each cloud's stamp,
+INPUT is a bag with points_semantic (and class_info), as fuse_bag writes it, a map.submaps, which has
+all that its bags had and takes other --poses, or a map.voxels of an earlier run with the same options,
+which is added. Poses come from tf at each cloud's stamp,
 interpolated; fused bags hold no tf, so name the bags that do; or from files of corrected poses:
 
   build_semantic_map.py fused.bag --tf drive.bag --out map
@@ -23,6 +24,8 @@ interpolated; fused bags hold no tf, so name the bags that do; or from files of 
   build_semantic_map.py fused.bag --tf drive.bag --out map --scheduler tcp://10.0.0.5:8786
   build_semantic_map.py --live points_semantic --out map        (Ctrl-C ends it and writes the map)
   build_semantic_map.py a/map.voxels b/map.voxels --out both
+  build_semantic_map.py fused.bag --tf drive.bag --submaps --out map
+  build_semantic_map.py map/map.submaps --poses slam.tum --out corrected     (without the bags)
 
 Written to --out: map.voxels (the map itself, first of all), map.json (what it is), and the --formats.
 A format that fails is left out with a warning, and the exit code is 1; the rest is there. Without
@@ -33,7 +36,9 @@ def make_parser():
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("inputs", metavar="INPUT", nargs="*", help="bags, or map.voxels files")
+    parser.add_argument(
+        "inputs", metavar="INPUT", nargs="*", help="bags, map.submaps or map.voxels"
+    )
     parser.add_argument(
         "--out", metavar="DIR", required=True, help="folder of the map; must be new"
     )
@@ -59,7 +64,8 @@ def make_parser():
     )
     parser.add_argument(
         "--poses", metavar="FILE", nargs="+", default=[], help="poses to take instead of tf, one file "
-        "for each bag: TUM (stamp x y z qx qy qz qw), or KITTI (3 x 4 matrices, one for each cloud)",
+        "for each bag (and each drive of a map.submaps, in order): TUM (stamp x y z qx qy qz qw), or "
+        "KITTI (3 x 4 matrices, one for each cloud)",
     )  # fmt: skip
     parser.add_argument(
         "--poses-frame",
@@ -81,6 +87,12 @@ def make_parser():
         action="store_true",
         help="also write labels/000000.label, ...: the map's class for each point of each cloud, with "
         "the ids of SemanticKITTI",
+    )
+    parser.add_argument(
+        "--submaps",
+        action="store_true",
+        help="also write map.submaps (half of the bags' size): an INPUT that other --poses place anew, "
+        "without the bags and without casting rays",
     )
     model = parser.add_argument_group("the map")
     model.add_argument("--voxel", metavar="M", type=float, default=0.2, help="edge (default: 0.2)")
@@ -187,8 +199,10 @@ def check(parser, options):
     """Leaves with exit code 2 unless the options fit together."""
     if bool(options.inputs) == bool(options.live):
         parser.error("give INPUT files or --live, one of them")
-    if options.scan_labels and not [p for p in options.inputs if not p.endswith(".voxels")]:
-        parser.error("--scan-labels needs bags")
+    bags = [path for path in options.inputs if not path.endswith((".voxels", ".submaps"))]
+    kept = [path for path in options.inputs if path.endswith(".submaps")]
+    if (options.scan_labels or options.submaps) and not bags:
+        parser.error("--scan-labels and --submaps need bags")
     if options.scheduler is not None and not options.scheduler.strip():
         parser.error("--scheduler: must be an address, such as tcp://10.0.0.5:8786")
     if options.live and (options.tf or options.poses or options.workers > 1 or options.scheduler):
@@ -197,10 +211,9 @@ def check(parser, options):
         parser.error("--duration needs --live")
     if options.workers > 1 and options.scheduler:
         parser.error("give --workers or --scheduler, one of them")
-    bags = [path for path in options.inputs if not path.endswith(".voxels")]
     if options.tf and len(bags) != 1 and len(options.tf) != len(bags):
         parser.error("--tf: give one bag for each input (%d), in their order" % len(bags))
-    if options.poses and len(options.poses) != len(bags):
+    if options.poses and not kept and len(options.poses) != len(bags):
         parser.error("--poses: give one file for each bag (%d), in their order" % len(bags))
     if options.poses_frame and not options.poses:
         parser.error("--poses-frame needs --poses")
@@ -238,6 +251,7 @@ def request_of(options):
         formats=options.formats,
         epsg=options.epsg,
         scan_labels=options.scan_labels,
+        submaps=options.submaps,
         tf=tuple(options.tf),
         topic=options.topic,
         odometry=options.odometry,

@@ -48,11 +48,21 @@ VoxelMapConfig makeConfig(double voxel_size_m, bool dirichlet, double weight, do
   return config;
 }
 
+Transform asTransform(const py::array& pose) {
+  const auto matrix = checked<double>(pose, 2, "pose").cast<py::array_t<double>>();
+  if (matrix.shape(0) != 4 || matrix.shape(1) != 4) throw py::value_error("pose: must be 4 x 4");
+  Transform result = Transform::Identity();
+  for (int row = 0; row < 3; ++row) {
+    for (int c = 0; c < 4; ++c) result(row, c) = matrix.at(row, c);
+  }
+  return result;
+}
+
 std::vector<std::size_t> integrate(VoxelMap* map, const py::array& x, const py::array& y,
                                    const py::array& z, const py::array& intensity,
                                    const py::array& status, const py::array& probabilities,
                                    const py::array& pose, StampNs stamp_ns,
-                                   const py::array& origins) {
+                                   const py::array& origins, const py::array& passes) {
   SemanticPoints points;
   points.count = static_cast<std::size_t>(checked<float>(x, 1, "x").shape(0));
   points.x = column(x);
@@ -75,12 +85,13 @@ std::vector<std::size_t> integrate(VoxelMap* map, const py::array& x, const py::
       throw py::value_error("origins: must be (N, 3), or empty");
     points.origins = from.data();
   }
-  const auto matrix = checked<double>(pose, 2, "pose").cast<py::array_t<double>>();
-  if (matrix.shape(0) != 4 || matrix.shape(1) != 4) throw py::value_error("pose: must be 4 x 4");
-  Transform T_map_lidar = Transform::Identity();
-  for (int row = 0; row < 3; ++row) {
-    for (int c = 0; c < 4; ++c) T_map_lidar(row, c) = matrix.at(row, c);
+  checked<std::uint8_t>(passes, 1, "passes");
+  if (passes.shape(0) != 0) {
+    if (static_cast<std::size_t>(passes.shape(0)) != points.count)
+      throw py::value_error("passes: must be (N,), or empty");
+    points.passes = column(passes);
   }
+  const Transform T_map_lidar = asTransform(pose);
   IntegrationCounts counts;
   {
     const py::gil_scoped_release release;
@@ -98,6 +109,24 @@ void add(VoxelMap* map, const Bytes& records, const Bytes& bricks) {
            static_cast<std::size_t>(bricks.size()));
 }
 
+void addMoved(VoxelMap* map, const Bytes& bricks, const py::array& T_theirs_ours) {
+  map->addMoved(bricks.data(), static_cast<std::size_t>(bricks.size()), asTransform(T_theirs_ours));
+}
+
+Bytes passesAt(const VoxelMap& map, const py::array& x, const py::array& y, const py::array& z,
+               const py::array& pose) {
+  SemanticPoints points;
+  points.count = static_cast<std::size_t>(checked<float>(x, 1, "x").shape(0));
+  points.x = column(x);
+  points.y = column(checked<float>(y, 1, "y"));
+  points.z = column(checked<float>(z, 1, "z"));
+  if (y.shape(0) != x.shape(0) || z.shape(0) != x.shape(0))
+    throw py::value_error("columns of different lengths");
+  Bytes result(static_cast<py::ssize_t>(points.count));
+  map.passesAt(points, asTransform(pose), result.mutable_data());
+  return result;
+}
+
 }  // namespace
 
 void addVoxelMap(py::module_& module) {
@@ -112,6 +141,8 @@ void addVoxelMap(py::module_& module) {
       .def_property_readonly("memory_bytes", &VoxelMap::memoryBytes)
       .def("integrate", &integrate)
       .def("add", &add)
+      .def("add_moved", &addMoved)
+      .def("passes_at", &passesAt)
       .def("records", [](const VoxelMap& map, bool sorted) { return arrayOf(map.records(sorted)); })
       .def("bricks", [](const VoxelMap& map, bool sorted) { return arrayOf(map.bricks(sorted)); })
       .def("keep_inside", &VoxelMap::keepInside)

@@ -51,6 +51,33 @@ void forEachBit(std::uint64_t bits, Visit visit) {
   for (; bits != 0; bits &= bits - 1) visit(__builtin_ctzll(bits));
 }
 
+/// floor() of |value| < 2^31; the library's is a call on processors before SSE 4.1.
+inline std::int32_t floorOf(double value) {
+  const auto whole = static_cast<std::int32_t>(value);
+  return whole - (value < static_cast<double>(whole) ? 1 : 0);
+}
+
+/// planes = count, up to kMaxPasses.
+void setCount(std::uint32_t count, int word, std::uint64_t bit, FreeBrick* brick) {
+  for (int k = 0; k < FreeBrick::kPlanes; ++k) {
+    if ((count >> k & 1U) != 0)
+      brick->planes[k][word] |= bit;
+    else
+      brick->planes[k][word] &= ~bit;
+  }
+}
+
+/// The voxel of theirs at the centre of ours; the plain numpy version takes the same sums.
+VoxelKey movedVoxel(const VoxelKey& ours, const MovedVoxels& theirs_ours) {
+  VoxelKey result;
+  for (std::size_t axis = 0; axis < 3; ++axis) {
+    const auto& t = theirs_ours[axis];
+    const double rest = t[1] * (ours[1] + 0.5) + t[2] * (ours[2] + 0.5) + t[3];
+    result[axis] = floorOf(t[0] * (ours[0] + 0.5) + rest);
+  }
+  return result;
+}
+
 VoxelKey voxelOf(const FreeBrick& brick, int word, int bit) {
   return {(brick.x << kBits) + (bit & kWithin), (brick.y << kBits) + (bit >> kBits),
           (brick.z << kBits) + word};
@@ -208,15 +235,52 @@ void FreeSpace::add(const FreeBrick& other, std::vector<VoxelKey>* passed,
         counts->push_back(count);
         return;
       }
-      const std::uint32_t sum = std::min(countAt(brick, word, mask) + count, kMaxPasses);
-      for (int k = 0; k < FreeBrick::kPlanes; ++k) {
-        if ((sum >> k & 1U) != 0)
-          brick.planes[k][word] |= mask;
-        else
-          brick.planes[k][word] &= ~mask;
-      }
+      setCount(std::min(countAt(brick, word, mask) + count, kMaxPasses), word, mask, &brick);
     });
   }
+}
+
+void FreeSpace::addMoved(const std::vector<FreeBrick>& bricks, const MovedVoxels& theirs_ours) {
+  // A voxel of ours whose centre lies in one of theirs is no further from that one's centre here
+  // than half the extent of the turned cube.
+  double reach[3];
+  for (std::size_t axis = 0; axis < 3; ++axis) {
+    reach[axis] = 1e-3;
+    for (const auto& row : theirs_ours) reach[axis] += 0.5 * std::abs(row[axis]);
+  }
+  for (const FreeBrick& brick : bricks) {
+    for (int word = 0; word < 8; ++word) {
+      forEachBit(anyOf(brick, word), [&](int bit) {
+        const VoxelKey theirs = voxelOf(brick, word, bit);
+        const std::uint32_t count = countAt(brick, word, std::uint64_t{1} << bit);
+        std::int32_t low[3], high[3];
+        for (std::size_t axis = 0; axis < 3; ++axis) {
+          double here = -0.5;
+          for (std::size_t row = 0; row < 3; ++row)
+            here += theirs_ours[row][axis] * (theirs[row] + 0.5 - theirs_ours[row][3]);
+          low[axis] = -floorOf(reach[axis] - here);
+          high[axis] = floorOf(here + reach[axis]);
+        }
+        for (std::int32_t z = low[2]; z <= high[2]; ++z) {
+          for (std::int32_t y = low[1]; y <= high[1]; ++y) {
+            for (std::int32_t x = low[0]; x <= high[0]; ++x) {
+              if (movedVoxel({x, y, z}, theirs_ours) == theirs) addPasses({x, y, z}, count);
+            }
+          }
+        }
+      });
+    }
+  }
+}
+
+void FreeSpace::addPasses(const VoxelKey& voxel, std::uint32_t count) {
+  const std::size_t index =
+      counted_.findOrMake(voxel[0] >> kBits, voxel[1] >> kBits, voxel[2] >> kBits);
+  Counted& brick = counted_.values()[index];
+  const int word = voxel[2] & kWithin;
+  const std::uint64_t bit = bitOf(voxel[0], voxel[1]);
+  if ((brick.claimed[word] & bit) != 0) return;
+  setCount(std::min(countAt(brick, word, bit) + count, kMaxPasses), word, bit, &brick);
 }
 
 std::vector<FreeBrick> FreeSpace::bricks(bool sorted) const {

@@ -93,6 +93,21 @@ void check(const VoxelMapConfig& config) {
   if (!problems.empty()) throw ConfigError(problems);
 }
 
+PlacementConstants placementOf(const Transform& T_map_lidar, double voxel_size_m) {
+  PlacementConstants result;
+  for (int row = 0; row < 3; ++row) {
+    for (int column = 0; column < 4; ++column) result.rows[row][column] = T_map_lidar(row, column);
+  }
+  result.voxel_size_m = voxel_size_m;
+  return result;
+}
+
+void checkWhole(std::size_t size, std::size_t unit, const char* what) {
+  if (size % unit != 0)
+    throw DataError("voxel map: " + std::to_string(size) + " bytes are no whole number of " + what +
+                    " of " + std::to_string(unit) + " bytes");
+}
+
 }  // namespace
 
 /// Points that enter the map.
@@ -103,6 +118,7 @@ struct VoxelMap::Batch {
   PlacedPoints placed = {};
   std::int64_t intensity[kSize];
   const std::uint8_t* probabilities[kSize];  ///< null = occupied only
+  std::uint8_t passes[kSize];                ///< as SemanticPoints tells them
   const double* origins[kSize];              ///< null = the pose's
 };
 
@@ -182,7 +198,7 @@ void VoxelMap::addBlock() {
   for (std::size_t i = 0; i < count; ++i) chunks_.push_back(blocks_.back().get() + i * words);
 }
 
-std::int64_t* VoxelMap::find(const VoxelKey& voxel) {
+std::int64_t* VoxelMap::find(const VoxelKey& voxel) const {
   const std::uint64_t xy = packXy(voxel[0], voxel[1]);
   const auto z = static_cast<std::uint32_t>(voxel[2]);
   const std::size_t mask = slots_.size() - 1;
@@ -220,11 +236,8 @@ inline std::uint32_t VoxelMap::findOrMake(std::uint64_t xy, std::uint32_t z, std
 IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transform& T_map_lidar,
                                       StampNs stamp) {
   IntegrationCounts counts;
-  PlacementConstants pose;
-  for (int row = 0; row < 3; ++row) {
-    for (int column = 0; column < 4; ++column) pose.rows[row][column] = T_map_lidar(row, column);
-  }
-  pose.voxel_size_m = config_.voxel_size_m;
+  const PlacementConstants pose = placementOf(T_map_lidar, config_.voxel_size_m);
+  casts_ = config_.ray_range_m > 0.0 && !points.passes.data;
   const double least = config_.min_range_m * config_.min_range_m;
   const double most = config_.max_range_m > 0.0 ? config_.max_range_m * config_.max_range_m
                                                 : std::numeric_limits<double>::infinity();
@@ -264,6 +277,7 @@ IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transf
     batch.origins[row] = points.origins ? points.origins + 3 * i : nullptr;
     float intensity = points.intensity.data ? valueAt<float>(points.intensity, i) : 0.0f;
     if (!(std::abs(intensity) <= kMaxIntensity)) intensity = 0.0f;
+    batch.passes[row] = points.passes.data ? valueAt<std::uint8_t>(points.passes, i) : 0;
     batch.intensity[row] = floorOf(static_cast<double>(intensity) * kIntensityUnit + 0.5);
     batch.placed.x[row] = x;
     batch.placed.y[row] = y;
@@ -272,7 +286,7 @@ IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transf
   }
   integrateBatch(pose, &batch, &counts);
   finishLooks(stamp);
-  castRays();
+  if (casts_) castRays();
   return counts;
 }
 
@@ -323,6 +337,8 @@ void VoxelMap::integrateBatch(const PlacementConstants& pose, Batch* batch,
       continue;
     }
     VoxelHeader* const voxel = header(record(found[i]));
+    if (!casts_ && (voxel->observations == 0 || batch->passes[i] < voxel->passes))
+      voxel->passes = voxel->passes_after = batch->passes[i];
     voxel->observations = saturatingSum(voxel->observations, 1);
     voxel->sum_x += placed.offset[0][i];
     voxel->sum_y += placed.offset[1][i];
@@ -332,7 +348,7 @@ void VoxelMap::integrateBatch(const PlacementConstants& pose, Batch* batch,
     const std::size_t looks = looks_.size();
     Look& look = lookAt(found[i], &index);
     // Rays to one voxel cross the same ones.
-    if (index == looks && config_.ray_range_m > 0.0) addRay(pose, *batch, i);
+    if (index == looks && casts_) addRay(pose, *batch, i);
     if (!has_distribution[i]) {
       ++counts->occupied;
       continue;
@@ -388,7 +404,7 @@ void VoxelMap::finishLooks(StampNs stamp) {
       voxel->looks = saturatingSum(voxel->looks, 1);
       voxel->first_ns = std::min<std::int64_t>(voxel->first_ns, stamp);
       voxel->last_ns = std::max<std::int64_t>(voxel->last_ns, stamp);
-      voxel->passes_after = 0;
+      if (casts_) voxel->passes_after = 0;
       if (looks_[i].labelled == 0) continue;
       records[rows] = at;
       rows += meanOfLook(i, rows_.data() + static_cast<std::size_t>(rows) * classes);
@@ -425,13 +441,8 @@ void VoxelMap::addPasses(std::uint32_t count, std::int64_t* record) {
 
 void VoxelMap::add(const std::uint8_t* records, std::size_t bytes, const std::uint8_t* bricks,
                    std::size_t brick_bytes) {
-  const auto check_whole = [](std::size_t size, std::size_t unit, const char* what) {
-    if (size % unit != 0)
-      throw DataError("voxel map: " + std::to_string(size) + " bytes are no whole number of " +
-                      what + " of " + std::to_string(unit) + " bytes");
-  };
-  check_whole(bytes, recordSize(), "records");
-  check_whole(brick_bytes, sizeof(FreeBrick), "bricks");
+  checkWhole(bytes, recordSize(), "records");
+  checkWhole(brick_bytes, sizeof(FreeBrick), "bricks");
   for (const std::uint8_t* at = records; at != records + bytes; at += recordSize()) addRecord(at);
   if (!(config_.ray_range_m > 0.0)) return;
   std::vector<VoxelKey> passed;
@@ -442,6 +453,46 @@ void VoxelMap::add(const std::uint8_t* records, std::size_t bytes, const std::ui
     free_.add(brick, &passed, &counts);
   }
   for (std::size_t i = 0; i < passed.size(); ++i) addPasses(counts[i], find(passed[i]));
+}
+
+void VoxelMap::addMoved(const std::uint8_t* bricks, std::size_t bytes,
+                        const Transform& T_theirs_ours) {
+  checkWhole(bytes, sizeof(FreeBrick), "bricks");
+  if (!(config_.ray_range_m > 0.0)) return;
+  std::vector<FreeBrick> theirs(bytes / sizeof(FreeBrick));
+  if (bytes > 0) std::memcpy(theirs.data(), bricks, bytes);
+  MovedVoxels theirs_ours;
+  for (int row = 0; row < 3; ++row) {
+    for (int column = 0; column < 4; ++column) {
+      theirs_ours[static_cast<std::size_t>(row)][static_cast<std::size_t>(column)] =
+          column < 3 ? T_theirs_ours(row, column) : T_theirs_ours(row, 3) / config_.voxel_size_m;
+    }
+  }
+  free_.addMoved(theirs, theirs_ours);
+}
+
+void VoxelMap::passesAt(const SemanticPoints& points, const Transform& T_map_lidar,
+                        std::uint8_t* passes) const {
+  const PlacementConstants pose = placementOf(T_map_lidar, config_.voxel_size_m);
+  PlacedPoints placed = {};
+  for (std::size_t begin = 0; begin < points.count; begin += Batch::kSize) {
+    const std::size_t count = std::min<std::size_t>(points.count - begin, Batch::kSize);
+    for (std::size_t i = 0; i < count; ++i) {
+      placed.x[i] = valueAt<float>(points.x, begin + i);
+      placed.y[i] = valueAt<float>(points.y, begin + i);
+      placed.z[i] = valueAt<float>(points.z, begin + i);
+    }
+    place_points_(pose, &placed);
+    for (std::size_t i = 0; i < count; ++i) {
+      const std::int64_t* const found =
+          placed.inside[i] ? find({placed.index[0][i], placed.index[1][i], placed.index[2][i]})
+                           : nullptr;
+      passes[begin + i] =
+          found
+              ? static_cast<std::uint8_t>(reinterpret_cast<const VoxelHeader*>(found)->passes_after)
+              : std::uint8_t{0};
+    }
+  }
 }
 
 void VoxelMap::addRecord(const std::uint8_t* at) {

@@ -24,14 +24,21 @@ from semantic_lidar_fusion.bags.bag_io import BagReader  # noqa: E402
 from semantic_lidar_fusion.bags.cloud_io import SemanticCloud  # noqa: E402
 from semantic_lidar_fusion.errors import DataError  # noqa: E402
 from semantic_lidar_fusion.labels import LabelSet  # noqa: E402
-from semantic_lidar_fusion.maps import build, formats, output, raster  # noqa: E402
+from semantic_lidar_fusion.maps import build, flat_files, formats, output, raster  # noqa: E402
 from semantic_lidar_fusion.maps.drive import Drive, read_poses  # noqa: E402
 from semantic_lidar_fusion.maps.ground import ground_surface, lowest_heights  # noqa: E402
 from semantic_lidar_fusion.maps.map_file import MapReader  # noqa: E402
 from semantic_lidar_fusion.maps.reading import STATIC, read  # noqa: E402
-from semantic_lidar_fusion.maps.records import BRICK, PATH, record_dtype  # noqa: E402
+from semantic_lidar_fusion.maps.records import (  # noqa: E402
+    BRICK,
+    PATH,
+    bricks_of,
+    canonical_order,
+    record_dtype,
+)
 from semantic_lidar_fusion.maps.semantic_map import MapConfig, native_module  # noqa: E402
 from semantic_lidar_fusion.maps.source import MapSource  # noqa: E402
+from semantic_lidar_fusion.maps.submaps import SubmapReader  # noqa: E402
 
 SOURCE_DIR = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))
 SCRIPT = os.path.join(SOURCE_DIR, "scripts", "build_semantic_map.py")
@@ -150,15 +157,11 @@ def test_a_scheduler_that_is_not_there_is_said(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(build, "DASK_PATIENCE_S", 1.0)
     with pytest.raises(DataError, match="no Dask scheduler at tcp://127.0.0.1:1"):
-        next(build._dask_results([], b"", "tcp://127.0.0.1:1"))
+        next(build._dask_results([], build.compute_part, "tcp://127.0.0.1:1"))
 
 
 def add_part(accumulator, result):
-    accumulator.add(
-        np.frombuffer(result.records, dtype=accumulator.voxels.dtype),
-        np.frombuffer(result.bricks, dtype=BRICK),
-        np.frombuffer(result.path, dtype=PATH),
-    )
+    accumulator.add(result.records, result.bricks, result.path)
 
 
 def test_without_the_compiled_module_the_same_bytes(room, built, tmp_path):
@@ -166,9 +169,14 @@ def test_without_the_compiled_module_the_same_bytes(room, built, tmp_path):
     reader = MapReader(os.path.join(built, "map.voxels"))
     part = build.parts_of(Drive(room[0], (room[1],)), 6)[0]
     plain, compiled = (
-        build.compute_part(part, reader.header.encoded(), native) for native in (False, None)
+        build.compute_part(part, reader.header.encoded(), native=native) for native in (False, None)
     )
-    assert plain == compiled and plain.clouds == 6 and len(plain.bricks) > 100 * BRICK.itemsize
+    assert plain[3:] == compiled[3:] and plain.clouds == 6
+    for name, bits in (("records", 0), ("bricks", 3)):
+        both = [getattr(part, name) for part in (plain, compiled)]
+        assert len(both[0]) > 100
+        one, other = (entries[canonical_order(entries, bits)].tobytes() for entries in both)
+        assert one == other
 
 
 def test_maps_add_up(room, built, tmp_path):
@@ -588,7 +596,7 @@ def test_a_failing_format_is_said_at_the_end(room, tmp_path):
     assert sorted(os.listdir(str(tmp_path / "map"))) == ["map.json", "map.npz", "map.voxels"]
 
 
-def test_far_apart_voxels_come_in_tiles(tmp_path):
+def test_far_apart_voxels_come_in_tiles(tmp_path, monkeypatch):
     """A jump of 40 km: 2-D maps in blocks, and no OctoMap."""
     labels = COST_LABELS
     config = MapConfig().checked(len(labels))
@@ -609,6 +617,200 @@ def test_far_apart_voxels_come_in_tiles(tmp_path):
     names = os.listdir(str(folder / "tiles"))
     assert "costs_+0000_+0000.pgm" in names and "elevation_+0048_+0000.png" in names
     assert (folder / "map.png").exists() and (folder / "map.ply").exists()
+
+    # A format that fails takes its own blocks with it.
+    def refuse(source, folder):
+        flat_files.write_grid(source, folder)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(formats.Format, "load", lambda entry: refuse)
+    output.export_map(str(folder), ["grid"], costs_of(labels), "", {})
+    left = os.listdir(str(folder / "tiles"))
+    assert sorted(left) == sorted(name for name in names if name[:5] not in ("costs", "occup"))
+
+
+def street_map(tmp_path):
+    """A source of a street of 40 x 3 cells with a house at x 20: small, and near the origin."""
+    header = build.MapHeader(MapConfig().checked(len(COST_NAMES)), COST_LABELS, "map")
+    records = np.zeros(123, dtype=record_dtype(len(COST_NAMES)))
+    records["x"], records["y"] = np.r_[np.tile(np.arange(40), 3), [20] * 3], 5
+    records["y"][:120] += np.repeat([0, 1, 2], 40)
+    records["z"][120:] = [5, 6, 7]
+    records["observations"] = records["looks"] = records["labelled"] = 3
+    records["evidence"][:120, COST_NAMES.index("road")] = 4 << 20
+    records["evidence"][120:, COST_NAMES.index("building")] = 4 << 20
+    path = np.array([(5 * 10**9, 1.0, 1.0, 0.0)], dtype=PATH)
+    folder = tmp_path / "street"
+    folder.mkdir()
+    accumulator = build.Accumulator(header, str(tmp_path), 1 << 30)
+    bricks = bricks_of(np.array([[3, 5, 4], [4, 5, 4]]), np.array([2, 1]))
+    accumulator.add(records, bricks, path)
+    accumulator.write(str(folder / "map.voxels"))
+    reader = MapReader(str(folder / "map.voxels"))
+    return MapSource(reader, costs_of(COST_LABELS), "street", 32756), str(folder)
+
+
+def message_module(monkeypatch, package, text):
+    """A package of messages as catkin would make it, of the text of its definitions."""
+    import types
+
+    from genpy.dynamic import generate_dynamic
+
+    made = generate_dynamic(text.split()[1], text.split("\n", 1)[1])
+    module = types.ModuleType(package + ".msg")
+    for name, kind in made.items():
+        setattr(module, name.split("/")[1], kind)
+    parent = types.ModuleType(package)
+    parent.msg = module
+    monkeypatch.setitem(sys.modules, package, parent)
+    monkeypatch.setitem(sys.modules, package + ".msg", module)
+
+
+HEADER_TEXT = "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+OCTOMAP_TEXT = "MSG: octomap_msgs/Octomap\nHeader header\nbool binary\nstring id\n"
+OCTOMAP_TEXT += "float64 resolution\nint8[] data\n" + HEADER_TEXT
+GRID_MAP_TEXT = (
+    """MSG: grid_map_msgs/GridMap
+GridMapInfo info
+string[] layers
+string[] basic_layers
+std_msgs/Float32MultiArray[] data
+uint16 outer_start_index
+uint16 inner_start_index
+================================================================================
+MSG: grid_map_msgs/GridMapInfo
+Header header
+float64 resolution
+float64 length_x
+float64 length_y
+geometry_msgs/Pose pose
+================================================================================
+MSG: geometry_msgs/Pose
+Point position
+Quaternion orientation
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+================================================================================
+MSG: std_msgs/Float32MultiArray
+MultiArrayLayout layout
+float32[] data
+================================================================================
+MSG: std_msgs/MultiArrayLayout
+MultiArrayDimension[] dim
+uint32 data_offset
+================================================================================
+MSG: std_msgs/MultiArrayDimension
+string label
+uint32 size
+uint32 stride
+"""
+    + HEADER_TEXT
+)
+
+
+def test_an_octomap_message_is_the_file(tmp_path, monkeypatch):
+    from semantic_lidar_fusion.maps import octomap
+
+    if native_module() is None or not native_module().has_octomap:
+        pytest.skip("liboctomap is not installed")
+    message_module(monkeypatch, "octomap_msgs", OCTOMAP_TEXT)
+    source, folder = street_map(tmp_path)
+    assert octomap.write_octomap(source, folder)["octomap_free"]
+    octomap.write_octomap_message(source, folder)
+    with BagReader(os.path.join(folder, "octomap.bag")) as bag:
+        (message,) = [item.message for item in bag.read(["/octomap"])]
+    tree = (tmp_path / "street" / "map.bt").read_bytes()
+    assert bytes(np.array(message.data, np.int8)) == tree.partition(b"\ndata\n")[2]
+    assert (message.id, message.binary, message.resolution) == ("OcTree", True, 0.2)
+    assert (message.header.frame_id, message.header.stamp.secs) == ("map", 5)
+    # Beyond its size a tree holds no free space, and then nothing.
+    monkeypatch.setattr(octomap, "MAX_VOXELS", 123)
+    assert not octomap.write_octomap(source, folder)["octomap_free"]
+    monkeypatch.setattr(octomap, "MAX_VOXELS", 100)
+    with pytest.raises(DataError, match="OctoMap: 123 voxels"):
+        octomap.write_octomap(source, folder)
+
+
+def test_a_grid_map_tells_its_layers_by_position(tmp_path, monkeypatch):
+    """By grid_map's own rule: rows against x, columns against y, stored column by column."""
+    from semantic_lidar_fusion.maps import gridmap
+
+    message_module(monkeypatch, "grid_map_msgs", GRID_MAP_TEXT)
+    source, folder = street_map(tmp_path)
+    gridmap.write_grid_map(source, folder)
+    with BagReader(os.path.join(folder, "grid_map.bag")) as bag:
+        (message,) = [item.message for item in bag.read(["/grid_map"])]
+    assert message.layers == ["elevation", "class", "confidence", "cost"]
+    info = message.info
+    rows = round(info.length_x / info.resolution)
+    assert (rows, round(info.length_y / info.resolution)) == (40, 3)
+
+    def at(layer, x, y):
+        row = int((info.pose.position.x + info.length_x / 2 - x) / info.resolution)
+        column = int((info.pose.position.y + info.length_y / 2 - y) / info.resolution)
+        return message.data[message.layers.index(layer)].data[column * rows + row]
+
+    house, road = (20.5 * 0.2, 5.5 * 0.2), (7.5 * 0.2, 6.5 * 0.2)
+    assert at("class", *house) == COST_NAMES.index("building") and at("cost", *house) == 100
+    assert at("class", *road) == COST_NAMES.index("road") and at("cost", *road) == 0
+    assert abs(at("elevation", *house)) < 0.2  # of the ground, not of the house
+
+
+def test_programs_of_others_read_the_coordinate_system(tmp_path):
+    source, folder = street_map(tmp_path)
+    if shutil.which("gdalinfo") and "geotiff" in formats.available():
+        formats.find("geotiff").load()(source, folder)
+        done = subprocess.run(
+            ["gdalinfo", os.path.join(folder, "classes.tif")],
+            stdout=subprocess.PIPE,
+            universal_newlines=True,
+            check=True,
+        )
+        assert "32756" in done.stdout and "Origin = (0.0" in done.stdout
+        assert "NoData Value=255" in done.stdout and "Pixel Size = (0.2" in done.stdout
+    laspy = pytest.importorskip("laspy")
+    formats.find("laz").load()(source, folder)
+    cloud = laspy.read(os.path.join(folder, "map.laz"))
+    assert len(cloud.points) == 123
+    assert any("32756" in getattr(vlr, "string", "") for vlr in cloud.header.vlrs)
+    assert (np.asarray(cloud.classification) == 6).sum() == 3
+    assert (np.asarray(cloud.classification) == 11).sum() == 120
+    np.testing.assert_array_equal(np.unique(cloud.label), [0, 2])
+
+
+def test_every_format_may_fail_alone(tmp_path, monkeypatch):
+    """Whichever is refused by the disk, the others are written and it leaves nothing."""
+    import importlib
+
+    source, folder = street_map(tmp_path)
+    wanted = [name for name in formats.available() if name != "picture"]
+    whole = output.export_map(folder, wanted, source.costs, "", {})
+    assert not whole.failed
+    everything = set(output.written_files(folder))
+
+    def refuse(source, folder):
+        raise OSError(28, "No space left on device")
+
+    for name in wanted:
+        entry = formats.find(name)
+        for file in set(os.listdir(folder)) - {"map.voxels"}:
+            os.remove(os.path.join(folder, file))
+        module, _, function = entry.writer.partition(":")
+        loaded = importlib.import_module("semantic_lidar_fusion.maps." + module)
+        with monkeypatch.context() as patched:
+            patched.setattr(loaded, function, refuse)
+            done = output.export_map(folder, wanted, source.costs, "", {})
+        assert list(done.failed) == [name]
+        assert set(output.written_files(folder)) == everything - set(entry.files)
 
 
 def test_poses_of_a_file_take_the_place_of_tf(room, built, tmp_path):
@@ -652,6 +854,78 @@ def test_poses_of_a_file_take_the_place_of_tf(room, built, tmp_path):
         (tmp_path / "bad.txt").write_text(text)
         done = run(room[0], "--poses", tmp_path / "bad.txt", "--out", tmp_path / "no")
         assert_one_line(done.returncode, done.stderr, word)
+
+
+def test_submaps_are_placed_anew_by_new_poses(room, built, tmp_path):
+    """What a build from the bags with the same poses makes: what returns say bit for bit, and what
+    rays removed in 99 % of the voxels. Poses of the lidar, and of the vehicle."""
+    from semantic_lidar_fusion.bags.poses import invert, make_transform, to_quaternion, to_rotation
+    from semantic_lidar_fusion.maps.drive import clouds_of
+    from semantic_lidar_fusion.maps.run import Request
+    from semantic_lidar_fusion.maps.run import build as build_map
+
+    def made(name, inputs, *poses, **more):
+        out = str(tmp_path / name)
+        files = tuple(str(path) for path in poses)
+        build_map(Request(out, tuple(map(str, inputs)), formats=(), poses=files, **more))
+        return MapReader(os.path.join(out, "map.voxels"))
+
+    done = run(room[0], "--tf", room[1], "--submaps", "--formats", "", "--out", tmp_path / "map")
+    assert done.returncode == 0, done.stderr
+    assert bytes_of(tmp_path / "map") == bytes_of(built)
+    kept = tmp_path / "map" / "map.submaps"
+    whole, again = MapReader(os.path.join(built, "map.voxels")), made("same", [kept])
+    for name in whole.dtype.names:
+        if name != "passes":
+            np.testing.assert_array_equal(again.records()[name], whole.records()[name])
+    for axis in "xyz":
+        np.testing.assert_allclose(again.path[axis], whole.path[axis], rtol=0, atol=1e-6)
+    # A drift that grows to 0.6 m and 2 degrees, as a loop that is closed takes out.
+    frame = whole.header.frame_id
+    seen = list(clouds_of(Drive(room[0], (room[1],)), frame, 0, 1 << 61))
+    start = seen[0].pose
+    files = {"lidar": [], "vehicle": []}
+    for number, entry in enumerate(seen):
+        share = number / len(seen)
+        turn = to_rotation(np.array([0.003 * share, 0.0, 0.017 * share, 1.0]))
+        drift = start @ make_transform(turn, [0.6 * share, 0.2 * share, 0.0]) @ invert(start)
+        for name, pose in (("lidar", drift @ entry.pose), ("vehicle", drift @ entry.vehicle)):
+            numbers = ["%d.%09d" % divmod(entry.cloud.stamp_ns, 10**9)]
+            numbers += ["%.12g" % v for v in (*pose[:3, 3], *to_quaternion(pose[:3, :3]))]
+            files[name].append(" ".join(numbers))
+    for name, lines in files.items():
+        (tmp_path / name).write_text("\n".join(lines))
+    fresh = made("fresh", [room[0]], tmp_path / "lidar", frame=frame)
+    anew = made("anew", [kept], tmp_path / "lidar", frame=frame)
+    records = fresh.records()
+    assert len(records) != len(whole) and len(records) == len(anew)
+    for name in ("x", "y", "z", "observations", "looks", "sum_x", "sum_z", "last_ns", "evidence"):
+        np.testing.assert_array_equal(anew.records()[name], records[name])
+    layers = []
+    for reader in (fresh, anew):
+        source = MapSource(reader, costs_of(reader.header.labels))
+        layers += [np.concatenate([source.layers(t, r) for t, r, _ in reader.read_tiles()])]
+    assert (layers[0] == layers[1]).mean() > 0.99
+    crossed = [sum(len(b) for _, _, b in reader.read_tiles()) for reader in (fresh, anew)]
+    assert abs(crossed[1] / crossed[0] - 1) < 0.1
+    # The vehicle's poses say the same of the lidar.
+    reader = SubmapReader(str(kept))
+    placed = reader.placed([str(tmp_path / "vehicle")], "base_link")[0]
+    expected = reader.placed([str(tmp_path / "lidar")], "")[0]
+    np.testing.assert_allclose(placed, expected, rtol=0, atol=2e-5)  # the digits of the file
+    assert np.abs(expected - reader.clouds["pose"]).max() > 0.5
+    # Two days are one map; the poses of both are asked for.
+    two = made("two", [kept, kept], tmp_path / "lidar", tmp_path / "lidar", frame=frame)
+    np.testing.assert_array_equal(two.records()["observations"], 2 * records["observations"])
+    with pytest.raises(DataError, match="1 files for 2 drives"):
+        made("no", [kept, room[0]], tmp_path / "lidar")
+    with pytest.raises(DataError, match="know the frames .* and base_link"):
+        made("no", [kept], tmp_path / "lidar", poses_frame="imu")
+    data = bytearray(kept.read_bytes())
+    data[len(data) // 2] ^= 1
+    kept.write_bytes(data)
+    done = run(kept, "--out", tmp_path / "no")
+    assert_one_line(done.returncode, done.stderr, "map.submaps: damaged")
 
 
 def test_scans_get_the_labels_of_the_map(room, built, tmp_path):

@@ -36,6 +36,9 @@ static_assert(sizeof(FreeBrick) == 272, "the brick is also the file's layout");
 /// A voxel's index.
 using VoxelKey = std::array<std::int32_t, 3>;
 
+/// Rows (rotation, translation) of a rigid transform between voxel indices of two maps.
+using MovedVoxels = std::array<std::array<double, 4>, 3>;
+
 /// From where a point was seen to where it lies, in voxels.
 struct Ray {
   double origin[3];
@@ -79,6 +82,9 @@ class FreeSpace {
   /// counts to `counts`.
   void add(const FreeBrick& brick, std::vector<VoxelKey>* passed,
            std::vector<std::uint32_t>* counts);
+  /// Adds bricks of a map whose voxels lie elsewhere, `theirs_ours`: a voxel gets the count of
+  /// theirs at its centre, unless it is claimed.
+  void addMoved(const std::vector<FreeBrick>& bricks, const MovedVoxels& theirs_ours);
   /// Bricks with passes, in order of tile, x, y, z if `sorted`.
   std::vector<FreeBrick> bricks(bool sorted) const;
 
@@ -91,6 +97,7 @@ class FreeSpace {
   struct Counted : FreeBrick {
     std::uint64_t claimed[8] = {};
   };
+  void addPasses(const VoxelKey& voxel, std::uint32_t count);
   struct Marked {
     std::int32_t x = 0, y = 0, z = 0;
     std::uint64_t crossed[8] = {}, spared[8] = {};

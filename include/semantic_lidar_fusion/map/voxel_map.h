@@ -78,6 +78,10 @@ struct SemanticPoints {
   /// Where the lidar was when it measured each point, 3 values each, m in the map frame. Null: at
   /// the cloud's pose for all.
   const double* origins = nullptr;
+  /// uint8, as VoxelMap::passesAt gave them: clouds whose rays crossed the place since its last
+  /// return. Data null: this cloud's rays are cast; else nothing is cast, and a voxel has passed
+  /// the least of its points (of all clouds).
+  Column passes;
 };
 
 /// What became of the points of a cloud.
@@ -110,6 +114,13 @@ class VoxelMap {
   /// give them. Throws DataError unless both are whole numbers of them.
   void add(const std::uint8_t* records, std::size_t bytes, const std::uint8_t* bricks = nullptr,
            std::size_t brick_bytes = 0);
+  /// Adds bricks of a map whose frame lies elsewhere, T_theirs_ours: a voxel here was crossed as
+  /// often as theirs at its centre. Voxels with a record stay as they are. Throws DataError
+  /// likewise.
+  void addMoved(const std::uint8_t* bricks, std::size_t bytes, const Transform& T_theirs_ours);
+  /// passes_after of the voxel of each point, 0 without one; `passes` holds points.count.
+  void passesAt(const SemanticPoints& points, const Transform& T_map_lidar,
+                std::uint8_t* passes) const;
   /// All records, in canonical order if `sorted`: by tile in x, tile in y, then voxel in x, y, z.
   /// Equal maps give equal bytes.
   std::vector<std::uint8_t> records(bool sorted = true) const;
@@ -143,7 +154,7 @@ class VoxelMap {
   static std::uint64_t hashOf(std::uint64_t xy, std::uint32_t z);
   void place(const Slot& slot);
   std::uint32_t findOrMake(std::uint64_t xy, std::uint32_t z, std::uint64_t hash);
-  std::int64_t* find(const VoxelKey& voxel);
+  std::int64_t* find(const VoxelKey& voxel) const;
   void grow();
   void addBlock();
   std::size_t chunksOfBlock(std::size_t first_chunk) const;
@@ -181,6 +192,7 @@ class VoxelMap {
   std::vector<float> rows_;                 ///< distributions of a batch
   std::vector<std::int32_t> row_evidence_;  ///< what they give
   // Of the cloud that is being integrated.
+  bool casts_ = false;  ///< its rays tell what they cross
   std::vector<Look> looks_;
   std::vector<std::int64_t> look_sums_;        ///< of probabilities, 2^-20
   std::vector<std::uint32_t> look_of_record_;  ///< holds where looks_ says so, too

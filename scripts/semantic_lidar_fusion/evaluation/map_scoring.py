@@ -25,7 +25,6 @@ from semantic_lidar_fusion.evaluation.metrics import Confusion, Reliability, rat
 from semantic_lidar_fusion.evaluation.scoring import FusedBag, Truth, paired
 from semantic_lidar_fusion.installation import package_file
 from semantic_lidar_fusion.labels import NO_LABEL, LabelSet
-from semantic_lidar_fusion.maps.build import pose_of_path
 from semantic_lidar_fusion.maps.drive import Poses
 from semantic_lidar_fusion.maps.ground import GROUND_BAND_M, ground_surface, lowest_heights
 from semantic_lidar_fusion.maps.map_file import joined_path
@@ -38,7 +37,7 @@ from semantic_lidar_fusion.maps.reading import (
     layers_of,
     read,
 )
-from semantic_lidar_fusion.maps.records import heights, voxel_indices
+from semantic_lidar_fusion.maps.records import heights, pose_of_path, voxel_indices
 from semantic_lidar_fusion.maps.semantic_map import MapConfig, VoxelMap
 
 # Voxels by the number of their points: least, and first that is too many.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From bags with semantic clouds to one map file, in one process or many.
+"""From bags with semantic clouds, or submaps, to one map file, in one process or many.
 
 The drives are cut into parts of a few scans. Every part becomes records and bricks, wherever it is
 computed; they are added up here in the order of time, and spilled to disk when they outgrow the memory
@@ -8,16 +8,31 @@ that they may take. One process, many workers and a cluster give the same bytes.
 
 import collections
 import dataclasses
+import functools
 import os
 import time
 from concurrent import futures
-from typing import Any, Callable, Deque, Dict, Iterable, Iterator, List, NamedTuple, Optional, Tuple
+from typing import (
+    Any,
+    Callable,
+    Deque,
+    Dict,
+    Iterable,
+    Iterator,
+    List,
+    NamedTuple,
+    Optional,
+    Sequence,
+    Tuple,
+    Union,
+)
 
 import numpy as np
 
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.bags.bag_io import BagReader
 from semantic_lidar_fusion.errors import DataError
+from semantic_lidar_fusion.maps import submaps
 from semantic_lidar_fusion.maps.drive import Drive, clouds_of
 from semantic_lidar_fusion.maps.map_file import (
     MapHeader,
@@ -26,7 +41,7 @@ from semantic_lidar_fusion.maps.map_file import (
     joined_path,
     merge_files,
 )
-from semantic_lidar_fusion.maps.records import BRICK, PATH, record_dtype
+from semantic_lidar_fusion.maps.records import pose_of_path
 from semantic_lidar_fusion.maps.semantic_map import COUNTS, VoxelMap
 
 SCANS_PER_PART = 20
@@ -42,6 +57,41 @@ class Part(NamedTuple):
     end_ns: int
 
 
+class Submaps(NamedTuple):
+    """A file of submaps to place by files of poses: one for each of its drives, or none at all."""
+
+    path: str
+    poses: Tuple[str, ...] = ()
+    poses_frame: str = ""
+
+
+class SubmapPart(NamedTuple):
+    """A submap and T_map_lidar (N, 4, 4) of its clouds, where they are known (N,)."""
+
+    path: str
+    number: int
+    begin_ns: int
+    poses: np.ndarray
+    known: np.ndarray
+
+
+AnyPart = Union[Part, SubmapPart]
+
+
+def submap_parts(source: Submaps) -> List[List[SubmapPart]]:
+    """The submaps of each drive of a file."""
+    reader = submaps.SubmapReader(source.path)
+    poses, known = reader.placed(source.poses, source.poses_frame)
+    result: List[List[SubmapPart]] = [[] for _ in reader.drives]
+    for number in np.unique(reader.clouds["submap"]):
+        own = np.flatnonzero(reader.clouds["submap"] == number)
+        first = reader.clouds[own[0]]
+        begin = int(first["stamp_ns"])
+        part = SubmapPart(source.path, int(number), begin, poses[own], known[own])
+        result[int(first["drive"])].append(part)
+    return result
+
+
 def parts_of(drive: Drive, scans: int = SCANS_PER_PART) -> List[Part]:
     """The drive in parts of so many clouds; clouds of one record time stay together."""
     with BagReader(drive.clouds) as bag:
@@ -52,26 +102,27 @@ def parts_of(drive: Drive, scans: int = SCANS_PER_PART) -> List[Part]:
 
 
 class PartResult(NamedTuple):
-    """Records, bricks and path (bytes of their types) of a part; clouds, of which without_pose were
+    """Records and bricks (in any order) and path of a part; clouds, of which without_pose were
     dropped, and what became of the points of the others (COUNTS)."""
 
-    records: bytes
-    bricks: bytes
-    path: bytes
+    records: np.ndarray
+    bricks: np.ndarray
+    path: np.ndarray
     clouds: int
     without_pose: int
     points: Dict[str, int]
+    submap: Optional[submaps.Submap] = None
 
 
-def pose_of_path(stamp_ns: int, position: np.ndarray) -> np.ndarray:
-    """(1,) of PATH."""
-    return np.array([(stamp_ns, *(float(v) for v in position))], dtype=PATH)
-
-
-def compute_part(part: Part, header_bytes: bytes, native: Optional[bool] = None) -> PartResult:
-    """Maps a part; runs in any process that reaches the bags."""
+def compute_part(
+    part: AnyPart, header_bytes: bytes, keep: bool = False, native: Optional[bool] = None
+) -> PartResult:
+    """Maps a part; runs in any process that reaches its file. keep: also make its submap."""
     header = MapHeader.decoded(header_bytes, "header")
+    if isinstance(part, SubmapPart):
+        return _place_part(part, header, native)
     voxels = VoxelMap(header.config, header.labels, native)
+    maker = submaps.SubmapMaker() if keep else None
     clouds = without_pose = 0
     path: List[np.ndarray] = []
     points = dict.fromkeys(COUNTS, 0)
@@ -83,14 +134,33 @@ def compute_part(part: Part, header_bytes: bytes, native: Optional[bool] = None)
         path.append(pose_of_path(seen.cloud.stamp_ns, seen.vehicle))
         for name, count in voxels.integrate(seen.cloud, seen.pose, seen.origins).items():
             points[name] += count
+        if maker is not None:
+            maker.add(seen)
     return PartResult(
-        voxels.records().tobytes(),
-        voxels.bricks().tobytes(),
-        joined_path(path).tobytes(),
+        voxels.records(in_order=False),
+        voxels.bricks(in_order=False),
+        joined_path(path),
         clouds,
         without_pose,
         points,
+        None if maker is None else maker.finish(voxels),
     )
+
+
+def _place_part(part: SubmapPart, header: MapHeader, native: Optional[bool]) -> PartResult:
+    submap = submaps.reader_of(part.path).submap(part.number)
+    placed = submaps.place(submap, part.poses, part.known, header, native)
+    return PartResult(
+        placed.voxels.records(in_order=False),
+        placed.voxels.bricks(in_order=False),
+        placed.path,
+        len(part.known),
+        placed.without_pose,
+        placed.points,
+    )
+
+
+Compute = Callable[[AnyPart], PartResult]
 
 
 class Accumulator:
@@ -123,6 +193,9 @@ class Accumulator:
         if self._path:
             self.spill()
         sources = self._runs + list(others)
+        if sources == self._runs and len(sources) == 1:
+            os.replace(self._runs.pop(), target)
+            return
         merge_files(sorted(sources, key=lambda p: MapReader(p).begin_ns), target, self.header)
         for run in self._runs:
             os.remove(run)
@@ -150,23 +223,30 @@ class Totals:
 
 
 def map_drives(
-    drives: List[Drive], header: MapHeader, work: Work, accumulator: Accumulator
+    drives: List[Drive],
+    header: MapHeader,
+    work: Work,
+    accumulator: Accumulator,
+    kept: Sequence[Submaps] = (),
+    writer: Optional[submaps.SubmapWriter] = None,
 ) -> Totals:
-    """Adds all clouds of the drives to the accumulator, the earliest drive first."""
-    by_drive = sorted(
-        (parts_of(drive) for drive in drives), key=lambda p: p[0].begin_ns if p else 0
-    )
+    """Adds all clouds of the drives and of files of submaps to the accumulator, the earliest drive
+    first. `writer` takes the submaps of the drives."""
+    by_drive: List[Sequence[AnyPart]] = [parts_of(drive) for drive in drives]
+    for source in kept:
+        by_drive += submap_parts(source)
+    by_drive.sort(key=lambda p: p[0].begin_ns if p else 0)
     parts = [part for of_drive in by_drive for part in of_drive]
-    encoded = header.encoded()
+    compute = functools.partial(
+        compute_part, header_bytes=header.encoded(), keep=writer is not None
+    )
     totals = Totals()
-    dtype = record_dtype(len(header.labels))
-    for result in cli.progress(_results(parts, encoded, work), len(parts), "map"):
+    results = _results(parts, compute, work)
+    for part, result in zip(parts, cli.progress(results, len(parts), "map")):
         totals.add(result)
-        accumulator.add(
-            np.frombuffer(result.records, dtype=dtype),
-            np.frombuffer(result.bricks, dtype=BRICK),
-            np.frombuffer(result.path, dtype=PATH),
-        )
+        if writer is not None and isinstance(part, Part) and result.submap is not None:
+            writer.add(result.submap, drives.index(part.drive))
+        accumulator.add(result.records, result.bricks, result.path)
     if totals.clouds and totals.clouds == totals.without_pose:
         raise DataError(
             "no pose covers any of the %d clouds; fused bags hold no tf: name the bags that do with "
@@ -175,20 +255,23 @@ def map_drives(
     return totals
 
 
-def _results(parts: List[Part], header: bytes, work: Work) -> Iterator[PartResult]:
+def _results(parts: List[AnyPart], compute: Compute, work: Work) -> Iterator[PartResult]:
     if work.scheduler is not None:
-        return _dask_results(parts, header, work.scheduler)
+        return _dask_results(parts, compute, work.scheduler)
     if work.workers > 1:
-        return _process_results(parts, header, work.workers)
-    return (compute_part(part, header) for part in parts)
+        return _process_results(parts, compute, work.workers)
+    return (compute(part) for part in parts)
 
 
 def _in_order(
-    parts: List[Part], limit: int, submit: Callable[[Part], Any], wait: Callable[[Any], PartResult]
+    parts: List[AnyPart],
+    limit: int,
+    submit: Callable[[AnyPart], Any],
+    wait: Callable[[Any], PartResult],
 ) -> Iterator[PartResult]:
     """Results in the order of the parts, with at most `limit` on their way: finished ones hold
     memory."""
-    remaining: Deque[Part] = collections.deque(parts)
+    remaining: Deque[AnyPart] = collections.deque(parts)
     flying: Deque[Any] = collections.deque()
     try:
         while remaining or flying:
@@ -201,20 +284,20 @@ def _in_order(
             future.cancel()
 
 
-def _process_results(parts: List[Part], header: bytes, workers: int) -> Iterator[PartResult]:
+def _process_results(parts: List[AnyPart], compute: Compute, workers: int) -> Iterator[PartResult]:
     with futures.ProcessPoolExecutor(max_workers=workers) as pool:
         try:
             yield from _in_order(
                 parts,
                 2 * workers,
-                lambda part: pool.submit(compute_part, part, header),
+                lambda part: pool.submit(compute, part),
                 lambda future: future.result(),
             )
         except futures.process.BrokenProcessPool as error:
             raise DataError("a worker process died (out of memory?)") from error
 
 
-def _dask_results(parts: List[Part], header: bytes, scheduler: str) -> Iterator[PartResult]:
+def _dask_results(parts: List[AnyPart], compute: Compute, scheduler: str) -> Iterator[PartResult]:
     cli.require("distributed")
     import logging
 
@@ -237,7 +320,7 @@ def _dask_results(parts: List[Part], header: bytes, scheduler: str) -> Iterator[
         yield from _in_order(
             parts,
             2 * max(1, workers),
-            lambda part: client.submit(compute_part, part, header, pure=False),
+            lambda part: client.submit(compute, part, pure=False),
             lambda future: _dask_wait(client, future, scheduler),
         )
     finally:
@@ -280,15 +363,16 @@ def _dask_wait(client: Any, future: Any, scheduler: str) -> PartResult:
         raise DataError("the Dask scheduler at %s is gone (%s)" % (scheduler, type(error).__name__)) from error  # fmt: skip
 
 
-def check_inputs(paths: List[str]) -> Tuple[List[str], List[str]]:
-    """Splits inputs into bags and map files."""
+class Inputs(NamedTuple):
+    """What a map is made of: bags, files of submaps, and map files."""
+
+    bags: List[str]
+    submaps: List[str]
+    maps: List[str]
+
+
+def check_inputs(paths: Sequence[str]) -> Inputs:
+    """Splits inputs by their endings."""
     maps = [path for path in paths if path.endswith(".voxels")]
-    return [path for path in paths if path not in maps], maps
-
-
-def same_header(maps: List[str]) -> MapHeader:
-    """The header that these map files share."""
-    header = MapReader(maps[0]).header
-    for path in maps[1:]:
-        header.require_same(MapReader(path).header, path)
-    return header
+    kept = [path for path in paths if path.endswith(submaps.ENDING)]
+    return Inputs([path for path in paths if path not in maps + kept], kept, maps)

@@ -46,7 +46,7 @@ class Drive:
 
 class SeenCloud(NamedTuple):
     """A cloud, T_map_lidar (4, 4) at its stamp, where the lidar was at each point's time ((N, 3), or
-    None), and where the vehicle was (3,)."""
+    None), and T_map_vehicle (4, 4), the lidar's own without such a frame."""
 
     cloud: SemanticCloud
     pose: np.ndarray
@@ -190,11 +190,11 @@ class Poses:
         poses, covered = self.lookup(frame_id, cloud.frame_id, stamp)
         if not covered[0] or pose_problem(poses[0]):
             return None
-        vehicle = poses[0][:3, 3]
+        vehicle = poses[0]
         try:
             found, known = self.lookup(frame_id, self.drive.vehicle_frame, stamp)
             if known[0] and not pose_problem(found[0]):
-                vehicle = found[0][:3, 3]
+                vehicle = found[0]
         except DataError:
             pass  # no such frame: the lidar's own path
         return SeenCloud(cloud, poses[0], self._origins(cloud, frame_id), vehicle)

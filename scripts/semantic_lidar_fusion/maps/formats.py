@@ -8,6 +8,7 @@ import importlib
 from typing import Any, Callable, Dict, List, NamedTuple, Tuple
 
 MAP_FILE, ABOUT_FILE = "map.voxels", "map.json"
+SUBMAPS_FILE = "map.submaps"  # on request
 TILES_FOLDER = "tiles"  # of 2-D maps that are too large for one file
 LABELS_FOLDER = "labels"  # of the scans
 
@@ -63,6 +64,12 @@ FORMATS: List[Format] = [
         ("osgeo.gdal",),
     ),
     Format("grid_map", "gridmap:write_grid_map", ("grid_map.bag",), ("grid_map_msgs.msg",)),
+    Format(
+        "octomap_msgs",
+        "octomap:write_octomap_message",
+        ("octomap.bag",),
+        ("semantic_lidar_fusion._core", "octomap_msgs.msg"),
+    ),
     Format("picture", "flat_files:write_picture", ("map.png",)),
 ]
 
@@ -78,7 +85,7 @@ def find(name: str) -> Format:
 
 def all_files() -> List[str]:
     """Every name that a map's folder may hold."""
-    names_of_files = [MAP_FILE, ABOUT_FILE, TILES_FOLDER, LABELS_FOLDER]
+    names_of_files = [MAP_FILE, ABOUT_FILE, SUBMAPS_FILE, TILES_FOLDER, LABELS_FOLDER]
     return names_of_files + [name for entry in FORMATS for name in entry.files]
 
 

@@ -20,10 +20,10 @@ from semantic_lidar_fusion.bags.cloud_io import SemanticCloud
 from semantic_lidar_fusion.errors import ConfigError, DataError
 from semantic_lidar_fusion.labels import LabelSet
 from semantic_lidar_fusion.bags.poses import from_message
-from semantic_lidar_fusion.maps.build import Totals, pose_of_path
+from semantic_lidar_fusion.maps.build import Totals
 from semantic_lidar_fusion.maps.drive import VEHICLE_FRAME, pose_problem
 from semantic_lidar_fusion.maps.map_file import MapHeader, MapWriter, joined_path, merge_files
-from semantic_lidar_fusion.maps.records import BRICK_BITS
+from semantic_lidar_fusion.maps.records import BRICK_BITS, pose_of_path
 from semantic_lidar_fusion.maps.semantic_map import COUNTS, MapConfig, VoxelMap
 
 MAX_WAITING = 10  # clouds
@@ -362,7 +362,7 @@ class LiveMapper:
 
     def _vehicle(self, cloud: SemanticCloud, pose: np.ndarray) -> np.ndarray:
         found = self._at(VEHICLE_FRAME, cloud.stamp_ns)
-        return (pose if found is None else found)[:3, 3]
+        return pose if found is None else found
 
     def _pose(self, message: Any, age_s: float) -> Optional[np.ndarray]:
         """T_map_lidar at the cloud's stamp; None = not yet; an empty array = never, counted."""

@@ -266,6 +266,7 @@ class NumpyVoxelMap:
         pose: np.ndarray,
         stamp_ns: int,
         origins: np.ndarray,
+        passes: np.ndarray,
     ) -> List[int]:
         known = status <= 3
         px, py, pz = (v.astype(np.float64) for v in (x, y, z))
@@ -275,17 +276,7 @@ class NumpyVoxelMap:
         chosen = known & finite & near
         counts = [0, 0, int((~known).sum()), int((known & finite & ~near).sum()), 0]
         counts[4] = int((known & ~finite).sum())
-        at, inside = np.empty((len(x), 3)), np.ones(len(x), dtype=bool)
-        whole, offsets = np.empty((len(x), 3)), np.empty((len(x), 3), dtype=np.int64)
-        for axis, row in enumerate(pose[:3]):
-            with np.errstate(invalid="ignore"):
-                at[:, axis] = row[0] * px + row[1] * py + row[2] * pz + row[3]
-                cell = at[:, axis] / self._size
-                good = (cell < _MAX_INDEX) & (cell > -_MAX_INDEX)
-            inside &= good
-            whole[:, axis] = np.floor(np.where(good, cell, 0.0))
-            within = np.where(good, at[:, axis], 0.0) - whole[:, axis] * self._size
-            offsets[:, axis] = np.floor(within * UNIT + 0.5)
+        at, whole, offsets, inside = self._placed((px, py, pz), pose)
         counts[3] += int((chosen & ~inside).sum())
         chosen &= inside
         labelled = chosen & (status == 0)
@@ -300,12 +291,83 @@ class NumpyVoxelMap:
         looks, first = self._looks(
             indices, offsets[chosen], intensities, labelled[chosen], probabilities[chosen], stamp_ns
         )
+        if len(passes):
+            self._add_passed(looks, indices, passes[chosen])
+            return counts
         free = np.zeros((0, 3), dtype=np.int64)
         if self._reach and len(first):
             begin = np.broadcast_to(pose[:3, 3], (len(x), 3)) if not len(origins) else origins
             free = self._crossed(begin[chosen][first], at[chosen][first], voxel_indices(looks))
         self._state = self._state.then(_State(looks, free, np.ones(len(free), dtype=np.int64)))
         return counts
+
+    def _placed(
+        self, xyz: Sequence[np.ndarray], pose: np.ndarray
+    ) -> Tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Positions (N, 3) m, voxels (N, 3), offsets from their corners (N, 3; 2^-20 m) and whether
+        they are usable (N,), of points x, y, z (N,) float64."""
+        x, y, z = xyz
+        at, inside = np.empty((len(x), 3)), np.ones(len(x), dtype=bool)
+        whole, offsets = np.empty((len(x), 3)), np.empty((len(x), 3), dtype=np.int64)
+        for axis, row in enumerate(pose[:3]):
+            with np.errstate(invalid="ignore"):
+                at[:, axis] = row[0] * x + row[1] * y + row[2] * z + row[3]
+                cell = at[:, axis] / self._size
+                good = (cell < _MAX_INDEX) & (cell > -_MAX_INDEX)
+            inside &= good
+            whole[:, axis] = np.floor(np.where(good, cell, 0.0))
+            within = np.where(good, at[:, axis], 0.0) - whole[:, axis] * self._size
+            offsets[:, axis] = np.floor(within * UNIT + 0.5)
+        return at, whole, offsets, inside
+
+    def passes_at(
+        self, x: np.ndarray, y: np.ndarray, z: np.ndarray, pose: np.ndarray
+    ) -> np.ndarray:
+        _, whole, _, inside = self._placed([v.astype(np.float64) for v in (x, y, z)], pose)
+        voxels, mine = whole.astype(np.int64), voxel_indices(self._state.records)
+        keys = _Keys(voxels, mine)
+        source = (keys.of(mine), self._state.records["passes_after"])
+        return np.where(inside, _passes(keys.of(voxels), source), 0).astype(np.uint8)
+
+    def _add_passed(self, looks: np.ndarray, indices: np.ndarray, passes: np.ndarray) -> None:
+        """Adds a cloud's looks; their voxels have passed the least of their points (indices (N, 3)),
+        of all clouds."""
+        mine = self._state.records
+        own, theirs = voxel_indices(mine), voxel_indices(looks)
+        keys = _Keys(own, theirs)
+        k_own, k_looks, k_points = keys.of(own), keys.of(theirs), keys.of(indices)
+        least = np.full(len(looks), MAX_PASSES, dtype=np.int64)
+        order = np.argsort(k_looks)
+        np.minimum.at(least, order[_find(k_looks[order], k_points)], passes)
+        known = np.isin(k_looks, k_own)
+        before = _passes(k_looks, (k_own, mine["passes"]))
+        least = np.where(known, np.minimum(least, before), least)
+        self._state = self._state.then(_State(looks, np.zeros((0, 3), np.int64), least[:0]))
+        records = self._state.records
+        k_all = keys.of(voxel_indices(records))
+        now = np.where(np.isin(k_all, k_looks), _passes(k_all, (k_looks, least)), records["passes"])
+        records["passes"] = records["passes_after"] = now
+
+    def add_moved(self, bricks: np.ndarray, T_theirs_ours: np.ndarray) -> None:
+        voxels, passes = free_voxels(bricks.view(BRICK))
+        if not self._reach or not len(voxels):
+            return
+        moved = T_theirs_ours[:3].copy()
+        moved[:, 3] = T_theirs_ours[:3, 3] / self._size
+        # All that may have their centre in one of theirs: around the centre of each.
+        here = np.floor((voxels + 0.5 - moved[:, 3]) @ moved[:, :3]).astype(np.int64)
+        around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 1, 3)
+        ours = np.unique((here + around).reshape(-1, 3), axis=0)
+        x, y, z = (ours + 0.5).T
+        at = [row[0] * x + (row[1] * y + row[2] * z + row[3]) for row in moved]
+        theirs = np.floor(np.stack(at, axis=1)).astype(np.int64)
+        keys = _Keys(theirs, voxels)
+        found = _passes(keys.of(theirs), (keys.of(voxels), passes))
+        mine = voxel_indices(self._state.records)
+        keys = _Keys(ours, mine)
+        kept = (found > 0) & ~np.isin(keys.of(ours), keys.of(mine))
+        nothing = np.zeros(0, self._dtype)
+        self._state = self._state.then(_State(nothing, ours[kept], found[kept]))
 
     def _looks(
         self,

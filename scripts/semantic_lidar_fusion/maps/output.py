@@ -2,6 +2,7 @@
 """The folder of a map: made aside and renamed, so that it is there whole or not at all."""
 
 import contextlib
+import glob
 import json
 import os
 import shutil
@@ -9,7 +10,7 @@ from typing import Any, Dict, List, NamedTuple, Optional, Sequence
 
 from semantic_lidar_fusion.errors import DataError, SemanticLidarFusionError, cannot_write
 from semantic_lidar_fusion.maps import formats
-from semantic_lidar_fusion.maps.formats import ABOUT_FILE, MAP_FILE
+from semantic_lidar_fusion.maps.formats import ABOUT_FILE, MAP_FILE, TILES_FOLDER, Format
 from semantic_lidar_fusion.maps.map_file import MapReader
 from semantic_lidar_fusion.maps.raster import Costs
 from semantic_lidar_fusion.maps.source import MapSource
@@ -98,9 +99,7 @@ def export_map(
             about.update(entry.load()(source, folder))
         except (SemanticLidarFusionError, OSError, MemoryError, ImportError) as error:
             failed[name] = str(error) or type(error).__name__
-            for file in entry.files:
-                with contextlib.suppress(OSError):
-                    os.remove(os.path.join(folder, file))
+            _remove_files(entry, folder)
     header = source.header
     counts = dict(zip(("static", "dynamic", "gone"), source.extent.counts))
     about.update(
@@ -121,6 +120,17 @@ def export_map(
     except OSError as error:
         failed["about"] = str(error)
     return Exported(counts, failed)
+
+
+def _remove_files(entry: Format, folder: str) -> None:
+    """Whatever a format may have written, whole or in blocks."""
+    names = [os.path.join(folder, file) for file in entry.files]
+    for file in entry.files:
+        stem, ending = os.path.splitext(file)
+        names += glob.glob(os.path.join(glob.escape(folder), TILES_FOLDER, stem + "_*" + ending))
+    for name in names:
+        with contextlib.suppress(OSError):
+            os.remove(name)
 
 
 def written_files(folder: str) -> List[str]:

@@ -24,6 +24,11 @@ BRICK = np.dtype(
 PATH = np.dtype([("stamp_ns", "<i8")] + [(name, "<f8") for name in ("x", "y", "z")])
 
 
+def pose_of_path(stamp_ns: int, pose: np.ndarray) -> np.ndarray:
+    """(1,) of PATH, of T_map_vehicle (4, 4)."""
+    return np.array([(stamp_ns, *(float(v) for v in pose[:3, 3]))], dtype=PATH)
+
+
 def record_dtype(class_count: int) -> np.dtype:
     """A voxel's record (80 + 8 C bytes): voxel index x y z; passes_after (clouds whose rays crossed it
     since its last return, up to MAX_PASSES); observations (points of status 0 to 3); looks (clouds

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """From what build_semantic_map.py is asked for to its files."""
 
+import contextlib
 import dataclasses
 import os
 import tempfile
@@ -13,14 +14,16 @@ from semantic_lidar_fusion.labels import LabelSet
 from semantic_lidar_fusion.maps import formats
 from semantic_lidar_fusion.maps.build import (
     Accumulator,
+    Inputs,
+    Submaps,
     Totals,
     Work,
     check_inputs,
     map_drives,
-    same_header,
 )
 from semantic_lidar_fusion.maps.drive import (
     CLOUD_TOPIC,
+    FRAMES,
     VEHICLE_FRAME,
     Drive,
     choose_frame,
@@ -32,6 +35,7 @@ from semantic_lidar_fusion.maps.map_file import MapHeader, MapReader
 from semantic_lidar_fusion.maps.output import Exported, OutputFolder, export_map, written_files
 from semantic_lidar_fusion.maps.raster import Costs
 from semantic_lidar_fusion.maps.semantic_map import MapConfig
+from semantic_lidar_fusion.maps.submaps import KeptDrive, SubmapReader, SubmapWriter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +50,7 @@ class Request:
     formats: Optional[Tuple[str, ...]] = None
     epsg: Optional[int] = None
     scan_labels: bool = False
+    submaps: bool = False
     tf: Tuple[str, ...] = ()
     topic: str = CLOUD_TOPIC
     odometry: str = ""
@@ -101,7 +106,7 @@ def _fill(request: Request, folder: str, wanted: List[str]) -> Tuple[MapHeader, 
 def _label_scans(request: Request, folder: str, exported: Exported) -> None:
     from semantic_lidar_fusion.maps.scan_labels import write_scan_labels
 
-    drives = drives_of(request, check_inputs(list(request.inputs))[0])
+    drives, _ = sources_of(request)
     reader = MapReader(os.path.join(folder, MAP_FILE))
     try:
         write_scan_labels(reader, drives, os.path.join(folder, formats.LABELS_FOLDER))
@@ -113,13 +118,12 @@ def _formats(wanted: Optional[Tuple[str, ...]]) -> List[str]:
     """As wanted, else all that can be written here."""
     if wanted is not None:
         return list(wanted)
-    available = formats.available()
-    if "octomap" in available:
-        from semantic_lidar_fusion.maps.semantic_map import native_module
+    from semantic_lidar_fusion.maps.semantic_map import native_module
 
-        if not native_module().has_octomap:  # type: ignore[union-attr]
-            available.remove("octomap")
-    return available
+    module = native_module()
+    if module is not None and module.has_octomap:
+        return formats.available()
+    return [name for name in formats.available() if not name.startswith("octomap")]
 
 
 def _report(out: str, header: MapHeader, totals: Totals, counts: Dict[str, int]) -> str:
@@ -166,41 +170,58 @@ def config_of(request: Request, labels: LabelSet) -> MapConfig:
     return dataclasses.replace(request.config, prior=prior).checked(len(labels))
 
 
-def drives_of(request: Request, bags: List[str]) -> List[Drive]:
-    """Bags with the bags of their tf and their poses; workers may run in another folder."""
+def sources_of(request: Request) -> Tuple[List[Drive], List[Submaps]]:
+    """Bags with the bags of their tf and their poses, and files of submaps with theirs; workers may
+    run in another folder. DataError unless there are as many files of poses as drives, or none."""
     tf = [os.path.abspath(path) for path in request.tf]
-    result = []
-    for number, bag in enumerate(bags):
-        own = tuple(tf) if len(bags) == 1 else tuple(tf[number : number + 1])
-        poses = request.poses[number] if request.poses else ""
-        result.append(
-            Drive(
-                os.path.abspath(bag),
-                own,
-                request.topic,
-                request.odometry,
-                os.path.abspath(poses) if poses else "",
-                request.poses_frame,
-                request.vehicle_frame,
-            )
+    remaining = [os.path.abspath(path) for path in request.poses]
+    inputs = check_inputs(request.inputs)
+    counts = {path: len(SubmapReader(path).drives) for path in inputs.submaps}
+    needed = len(inputs.bags) + sum(counts[path] for path in inputs.submaps)
+    if remaining and len(remaining) != needed:
+        raise DataError(
+            "--poses: %d files for %d drives; give one for each bag and each drive of the submaps, in "
+            "the order of the inputs" % (len(remaining), needed)
         )
-    return result
+    drives: List[Drive] = []
+    kept: List[Submaps] = []
+    for path in request.inputs:
+        count = counts.get(path, 1 if path in inputs.bags else 0)
+        poses, remaining = tuple(remaining[:count]), remaining[count:]
+        if path in inputs.submaps:
+            kept.append(Submaps(os.path.abspath(path), poses, request.poses_frame))
+        elif path in inputs.bags:
+            number = len(drives)
+            drives.append(
+                Drive(
+                    os.path.abspath(path),
+                    tuple(tf) if len(inputs.bags) == 1 else tuple(tf[number : number + 1]),
+                    request.topic,
+                    request.odometry,
+                    poses[0] if poses else "",
+                    request.poses_frame,
+                    request.vehicle_frame,
+                )
+            )
+    return drives, kept
 
 
-def _map_files(request: Request, folder: str) -> Tuple[MapHeader, Totals]:
-    bags, maps = check_inputs(list(request.inputs))
-    header = same_header(maps) if maps else None
-    drives = drives_of(request, bags)
+def _header_of(request: Request, drives: List[Drive], inputs: Inputs) -> MapHeader:
+    """Of the map that the inputs make together; DataError where they do not fit."""
+    known = [(path, SubmapReader(path).header) for path in inputs.submaps]
+    if request.poses:
+        # They say where the clouds are in another frame than tf does.
+        frame = request.frame.lstrip("/") or FRAMES[0]
+        known = [(path, header._replace(frame_id=frame)) for path, header in known]
+    known += [(path, MapReader(path).header) for path in inputs.maps]
     if drives:
         cloud = first_cloud(drives[0])
         labels = class_set(drives[0], cloud, request.classes)
         frame_id = choose_frame(drives[0], cloud, request.frame)
-        ours = MapHeader(config_of(request, labels), labels, frame_id)
-        if header is not None:
-            ours.require_same(header, maps[0])
-        header = ours
-    elif header is not None:
+        header = MapHeader(config_of(request, labels), labels, frame_id)
+    else:
         # What acts on reading alone is as asked for.
+        header = known[0][1]
         config = dataclasses.replace(
             header.config,
             clamp=request.config.clamp,
@@ -208,13 +229,31 @@ def _map_files(request: Request, folder: str) -> Tuple[MapHeader, Totals]:
             footprint_m=request.config.footprint_m,
         )
         header = header._replace(config=config.checked(len(header.labels)))
-    assert header is not None
-    with tempfile.TemporaryDirectory(prefix=".runs.", dir=folder) as runs:
+    for path, other in known:
+        header.require_same(other, path)
+    return header
+
+
+def _map_files(request: Request, folder: str) -> Tuple[MapHeader, Totals]:
+    drives, kept = sources_of(request)
+    inputs = check_inputs(request.inputs)
+    header = _header_of(request, drives, inputs)
+    with contextlib.ExitStack() as stack:
+        runs = stack.enter_context(tempfile.TemporaryDirectory(prefix=".runs.", dir=folder))
+        writer = None
+        if request.submaps:
+            frames = [first_cloud(drive).frame_id.lstrip("/") for drive in drives]
+            names = [
+                KeptDrive(os.path.basename(drive.clouds), frame, drive.vehicle_frame.lstrip("/"))
+                for drive, frame in zip(drives, frames)
+            ]
+            target = os.path.join(folder, formats.SUBMAPS_FILE)
+            writer = stack.enter_context(SubmapWriter(target, header, names))
         accumulator = Accumulator(header, runs, request.memory_mb << 20)
         totals = Totals()
-        if drives:
-            totals = map_drives(drives, header, request.work, accumulator)
-        accumulator.write(os.path.join(folder, MAP_FILE), maps)
+        if drives or kept:
+            totals = map_drives(drives, header, request.work, accumulator, kept, writer)
+        accumulator.write(os.path.join(folder, MAP_FILE), inputs.maps)
     return header, totals
 
 

@@ -115,6 +115,10 @@ def native_module() -> Optional[Any]:
         return None
 
 
+def _as_type(values: np.ndarray, dtype: Any) -> np.ndarray:
+    return values if values.dtype == dtype else values.astype(dtype)
+
+
 class VoxelMap:
     """A map in memory. `native`: True needs the compiled module, False takes numpy, None takes the
     faster one that is there. Both give the same bytes."""
@@ -182,16 +186,14 @@ class VoxelMap:
         pose: np.ndarray,
         stamp_ns: int,
         origins: Optional[np.ndarray] = None,
+        passes: Optional[np.ndarray] = None,
     ) -> Dict[str, int]:
         """The same for columns: x, y, z and intensity (N,) float32, status (N,) uint8,
-        probabilities (N, C) float32."""
-
-        def as_type(values: np.ndarray, dtype: Any) -> np.ndarray:
-            return values if values.dtype == dtype else values.astype(dtype)
-
-        columns = [as_type(np.asarray(v), np.float32) for v in (*xyz, intensity)]
-        columns.append(as_type(np.asarray(status), np.uint8))
-        probabilities = as_type(np.asarray(probabilities), np.float32)
+        probabilities (N, C) float32. `passes` (N,) uint8: what `passes_at` said of these points in
+        another map; they take the place of rays."""
+        columns = [_as_type(np.asarray(v), np.float32) for v in (*xyz, intensity)]
+        columns.append(_as_type(np.asarray(status), np.uint8))
+        probabilities = _as_type(np.asarray(probabilities), np.float32)
         if probabilities.shape[1] > 1 and probabilities.strides[1] != 4:
             probabilities = np.ascontiguousarray(probabilities)
         pose = np.ascontiguousarray(pose, dtype=np.float64)
@@ -199,7 +201,8 @@ class VoxelMap:
             raise DataError("the pose of a cloud is not finite")
         begin = np.zeros((0, 3)) if origins is None else origins
         begin = np.ascontiguousarray(begin, dtype=np.float64)
-        result = self._map.integrate(*columns, probabilities, pose, int(stamp_ns), begin)
+        known = np.zeros(0, dtype=np.uint8) if passes is None else passes
+        result = self._map.integrate(*columns, probabilities, pose, int(stamp_ns), begin, known)
         return dict(zip(COUNTS, (int(value) for value in result)))
 
     def add(self, records: np.ndarray, bricks: Optional[np.ndarray] = None) -> None:
@@ -211,6 +214,21 @@ class VoxelMap:
             np.ascontiguousarray(part).view(np.uint8).reshape(-1) for part in (records, bricks)
         ]
         self._map.add(*parts)
+
+    def add_moved(self, bricks: np.ndarray, T_theirs_ours: np.ndarray) -> None:
+        """Adds bricks (M,) of a map whose frame lies elsewhere: a voxel here was crossed as often as
+        theirs at its centre. Voxels with a record stay as they are."""
+        data = np.ascontiguousarray(bricks).view(np.uint8).reshape(-1)
+        self._map.add_moved(data, np.ascontiguousarray(T_theirs_ours, dtype=np.float64))
+
+    def passes_at(self, xyz: Sequence[np.ndarray], pose: np.ndarray) -> np.ndarray:
+        """(N,) uint8: passes_after of the voxel of each point, 0 without one; x, y, z (N,) in the lidar
+        frame, seen from the pose T_map_lidar (4, 4)."""
+        columns = [_as_type(np.asarray(v), np.float32) for v in xyz]
+        found: np.ndarray = self._map.passes_at(
+            *columns, np.ascontiguousarray(pose, dtype=np.float64)
+        )
+        return found
 
     def records(self, in_order: bool = True) -> np.ndarray:
         """(N,) of `record_dtype`; in canonical order (tile in x, tile in y, then x, y, z) equal maps
