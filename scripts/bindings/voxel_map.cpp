@@ -48,14 +48,8 @@ VoxelMapConfig makeConfig(double voxel_size_m, bool dirichlet, double weight, do
   return config;
 }
 
-Transform asTransform(const py::array& pose) {
-  const auto matrix = checked<double>(pose, 2, "pose").cast<py::array_t<double>>();
-  if (matrix.shape(0) != 4 || matrix.shape(1) != 4) throw py::value_error("pose: must be 4 x 4");
-  Transform result = Transform::Identity();
-  for (int row = 0; row < 3; ++row) {
-    for (int c = 0; c < 4; ++c) result(row, c) = matrix.at(row, c);
-  }
-  return result;
+Transform poseOf(const py::array& pose) {
+  return transformOf(checked<double>(pose, 2, "pose").cast<Doubles>());
 }
 
 std::vector<std::size_t> integrate(VoxelMap* map, const py::array& x, const py::array& y,
@@ -91,7 +85,7 @@ std::vector<std::size_t> integrate(VoxelMap* map, const py::array& x, const py::
       throw py::value_error("passes: must be (N,), or empty");
     points.passes = column(passes);
   }
-  const Transform T_map_lidar = asTransform(pose);
+  const Transform T_map_lidar = poseOf(pose);
   IntegrationCounts counts;
   {
     const py::gil_scoped_release release;
@@ -110,7 +104,7 @@ void add(VoxelMap* map, const Bytes& records, const Bytes& bricks) {
 }
 
 void addMoved(VoxelMap* map, const Bytes& bricks, const py::array& T_theirs_ours) {
-  map->addMoved(bricks.data(), static_cast<std::size_t>(bricks.size()), asTransform(T_theirs_ours));
+  map->addMoved(bricks.data(), static_cast<std::size_t>(bricks.size()), poseOf(T_theirs_ours));
 }
 
 Bytes passesAt(const VoxelMap& map, const py::array& x, const py::array& y, const py::array& z,
@@ -123,7 +117,7 @@ Bytes passesAt(const VoxelMap& map, const py::array& x, const py::array& y, cons
   if (y.shape(0) != x.shape(0) || z.shape(0) != x.shape(0))
     throw py::value_error("columns of different lengths");
   Bytes result(static_cast<py::ssize_t>(points.count));
-  map.passesAt(points, asTransform(pose), result.mutable_data());
+  map.passesAt(points, poseOf(pose), result.mutable_data());
   return result;
 }
 
