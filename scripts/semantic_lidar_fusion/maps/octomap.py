@@ -76,9 +76,10 @@ def to_message(path: str, frame_id: str, stamp_ns: int) -> Any:
 
     with open(path, "rb") as file:
         header, _, data = file.read().partition(b"\ndata\n")
-    fields = dict(
-        line.split(b" ", 1) for line in header.split(b"\n") if line[:1] not in (b"#", b"")
-    )
+    fields: Dict[bytes, bytes] = {}
+    for line in header.split(b"\n"):
+        name, _, value = line.partition(b" ")
+        fields[name] = value
     message = Octomap()
     message.header.frame_id = frame_id
     message.header.stamp = to_stamp(stamp_ns)
