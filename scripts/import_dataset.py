@@ -1,6 +1,7 @@
 #!/usr/bin/python3
 # SPDX-License-Identifier: MIT
-"""Turns a public data set in its own folder layout into a bag and a rig file for fuse_bag."""
+"""Turns a public data set in its own folder layout into a bag and a rig file for fuse_bag, and a bag of
+ROS 2 into one of ROS 1."""
 
 import argparse
 import os
@@ -143,6 +144,18 @@ def make_parser():
     calibration.add_argument(
         "--camera-info", metavar="FILE", help="default: camera_info.yaml of DIR, DIR/cfg or above"
     )
+    for name, what in (("ros2", "a bag of ROS 2"), ("mcap", "an MCAP file of ROS 2")):
+        bag = datasets.add_parser(
+            name,
+            help=what,
+            description="A folder with metadata.yaml, or .mcap and .db3 files: messages keep their "
+            "times and topics. PyPI's rosbags reads them (pip install rosbags). make_rig.py then "
+            "proposes a rig file.",
+        )
+        bag.add_argument(
+            "sources", metavar="IN", nargs="+", help="the bag, or several of one drive"
+        )
+        bag.add_argument("bag", metavar="OUT.bag", help="the bag to write")
     commands = (kitti, semantickitti, rellis, usyd, kitti360, nuscenes, calibration)
     for command in commands:
         what = (
@@ -253,11 +266,24 @@ def import_usyd(options, labels, rig_path):
     print("%s: rig file" % rig_path)
 
 
+def import_ros2(options):
+    """A bag of ROS 2, whose messages pass with their times."""
+    from semantic_lidar_fusion.datasets import ros2
+
+    summary = ros2.convert(options.sources, options.bag)
+    for topic, kind in sorted(summary.left_out.items()):
+        cli.warn("%s is left out: nothing defines its type %s" % (topic, kind))
+    print("%s: %d messages on %d topics" % (options.bag, summary.messages, summary.topics))
+    print("Then: make_rig.py %s --out rig.yaml" % options.bag)
+
+
 def main():
     parser = make_parser()
     options = parser.parse_args()
     if options.dataset is None:
-        parser.error("name a data set: %s" % ", ".join(DEFAULT_CLASSES))
+        parser.error("name a data set: %s" % ", ".join([*DEFAULT_CLASSES, "ros2", "mcap"]))
+    if options.dataset in ("ros2", "mcap"):
+        return import_ros2(options)
     cli.require("numpy", "scipy", "yaml", "rosbag", "sensor_msgs.msg", "tf2_msgs.msg")
     from semantic_lidar_fusion.datasets import writer
     from semantic_lidar_fusion.labels import LabelSet, package_file

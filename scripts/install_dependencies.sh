@@ -5,6 +5,7 @@
 #
 #   scripts/install_dependencies.sh [options]
 #     --no-testing       leave out what only tests and benchmarks use
+#     --rviz             also RViz and rqt_reconfigure, as far as the release has them
 #     --help             this text
 set -euo pipefail
 PATH=/usr/sbin:/usr/bin:/sbin:/bin
@@ -12,11 +13,12 @@ PATH=/usr/sbin:/usr/bin:/sbin:/bin
 source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 formatters=$source_dir/test/lint/formatters.txt
 
-testing=1
+testing=1 rviz=0
 for option in "$@"; do
   case $option in
     --no-testing) testing=0 ;;
-    --help | -h) sed -n '3,8s/^# \{0,1\}//p' "$0"; exit 0 ;;
+    --rviz) rviz=1 ;;
+    --help | -h) sed -n '3,9s/^# \{0,1\}//p' "$0"; exit 0 ;;
     *) echo "install_dependencies: unknown option '$option'; try --help" >&2; exit 2 ;;
   esac
 done
@@ -24,7 +26,8 @@ done
 # name on Debian (ROS in the distribution itself)
 debian_ros="catkin libroscpp-dev libnodelet-dev libnodeletlib-dev libnodeletlib-tools pluginlib-dev
   libcv-bridge-dev libtf2-dev libtf2-ros-dev libtf2-eigen-dev libtf2-msgs-dev
-  libdiagnostic-updater-dev libsensor-msgs-dev libnav-msgs-dev
+  libdiagnostic-updater-dev libdynamic-reconfigure-config-init-mutex-dev libstd-srvs-dev
+  python3-dynamic-reconfigure libsensor-msgs-dev libnav-msgs-dev
   libstd-msgs-dev libgeometry-msgs-dev libdiagnostic-msgs-dev librosbag-dev
   librosbag-storage-dev librostest-dev python3-catkin-pkg python3-roslaunch python3-rosbag
   python3-rospy python3-cv-bridge python3-tf2-ros python3-tf2-msgs python3-sensor-msgs
@@ -34,7 +37,7 @@ debian_ros="catkin libroscpp-dev libnodelet-dev libnodeletlib-dev libnodeletlib-
 # name on Ubuntu 20.04 with the ROS Noetic repository
 noetic_ros="ros-noetic-catkin ros-noetic-roscpp ros-noetic-nodelet ros-noetic-pluginlib
   ros-noetic-cv-bridge ros-noetic-tf2 ros-noetic-tf2-ros ros-noetic-tf2-eigen ros-noetic-tf2-msgs
-  ros-noetic-diagnostic-updater ros-noetic-sensor-msgs
+  ros-noetic-diagnostic-updater ros-noetic-dynamic-reconfigure ros-noetic-sensor-msgs
   ros-noetic-nav-msgs ros-noetic-std-msgs ros-noetic-std-srvs ros-noetic-geometry-msgs
   ros-noetic-diagnostic-msgs
   ros-noetic-rosbag ros-noetic-rosbag-storage ros-noetic-roslaunch
@@ -60,6 +63,14 @@ if [ "$testing" = 1 ]; then
     optional="$optional ros-noetic-pcl-ros"
   else
     optional="$optional libpcl-ros-dev"
+  fi
+fi
+
+if [ "$rviz" = 1 ]; then
+  if [ -d /opt/ros/noetic ]; then
+    optional="$optional ros-noetic-rviz ros-noetic-rqt-reconfigure"
+  else
+    optional="$optional rviz"
   fi
 fi
 
@@ -127,6 +138,16 @@ finish() {
     if ! { python3 -m venv "$source_dir/.tools" &&
       "$source_dir/.tools/bin/pip" install --quiet $wanted; } >/dev/null 2>&1; then
       say "going on without$wanted"
+    fi
+  fi
+  # What reads bags of ROS 2, for the test of import_dataset.py; Debian has no package of it.
+  if [ "$testing" = 1 ] && [ ! -e "$source_dir/.tools/python/rosbags" ] &&
+    installed python3-venv && python3 -c 'import sys; sys.exit(sys.version_info < (3, 10))'; then
+    say "installing rosbags into .tools"
+    { [ -e "$source_dir/.tools/bin/pip" ] || python3 -m venv "$source_dir/.tools"; } >/dev/null 2>&1
+    if ! "$source_dir/.tools/bin/pip" install --quiet --target "$source_dir/.tools/python" rosbags \
+      >/dev/null 2>&1; then
+      say "going on without rosbags"
     fi
   fi
   say "$1"

@@ -43,7 +43,7 @@ string frame_id
 _PACKET_DEFINITION = """time stamp
 uint8[1206] data
 """
-_DEFINITIONS = {
+DEFINITIONS = {
     "velodyne_msgs/VelodynePacket": _PACKET_DEFINITION,
     "velodyne_msgs/VelodyneScan": _HEADER
     + "VelodynePacket[] packets\n"
@@ -89,10 +89,10 @@ def message_class(type_name: str) -> Any:
         found = None
     if found is not None:
         return found
-    if type_name not in _DEFINITIONS:
+    if type_name not in DEFINITIONS:
         raise DataError("the message type %s is not installed" % type_name)
     if type_name not in _generated:
-        generated = genpy.dynamic.generate_dynamic(type_name, _DEFINITIONS[type_name])
+        generated = genpy.dynamic.generate_dynamic(type_name, DEFINITIONS[type_name])
         _generated.update(generated)
         if _generated[type_name]._md5sum != _MD5[type_name]:
             raise AssertionError("the definition of %s has changed" % type_name)
