@@ -114,7 +114,8 @@ class Clouds(Sequence[SemanticCloud]):
         if self._bag.topics.get(self.topic) != _CLOUD_TYPE:
             self.close()
             raise DataError("%s: no clouds on %s" % (path, self.topic))
-        self.stamps_ns = sorted(set(self._bag.stamps_ns(self.topic)))
+        # Two scans may share one t_ref, which is their clouds' record time.
+        self.stamps_ns = sorted(self._bag.stamps_ns(self.topic))
         self.labels = self._class_set()
 
     def _only_topic(self) -> str:
@@ -140,8 +141,10 @@ class Clouds(Sequence[SemanticCloud]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         stamp = self.stamps_ns[index]
-        for message in self._bag.read(self.topic, (stamp, stamp)):
-            return _cloud(message)
+        among_equals = range(len(self))[index] - self.stamps_ns.index(stamp)
+        for number, message in enumerate(self._bag.read(self.topic, (stamp, stamp))):
+            if number == among_equals:
+                return _cloud(message)
         raise DataError("%s: the cloud at %d ns is gone" % (self.path, stamp))
 
     def __iter__(self) -> Iterator[SemanticCloud]:
