@@ -14,8 +14,8 @@ from semantic_lidar_fusion import cli  # noqa: E402
 
 EPILOG = """\
 The truth is the topic /points_truth (PointCloud2: x y z, label u8 = class id; the same points in the
-same order as the scan); simulate_drive and import_dataset.py write it. Written to --out: report.md,
-table1.csv, summary.csv, confusion_*.csv, visibility.csv, temperatures.csv, masks.csv, and PNG plots.
+same order as the scan); simulate_drive, import_dataset.py and exchange_labels.py write it. Written to
+--out: report.html (everything in one file, for a browser), report.md, tables.tex, table1.csv, summary.csv, confusion_*.csv, visibility.csv, temperatures.csv, masks.csv, and PNG plots.
 docs/results.md explains every table.
 
   evaluate.py drive.bag --rig rig.yaml --out results
@@ -78,6 +78,13 @@ def make_parser():
         action="store_true",
         help="also the rig with true visibility, with true odometry and with both, from the truth "
         "of simulate_drive",
+    )
+    parser.add_argument(
+        "--compare",
+        metavar=("A", "B"),
+        nargs=2,
+        default=(),
+        help="two columns of the table: differences of F1, B minus A, with paired intervals",
     )
     parser.add_argument(
         "--min-edge-px",
@@ -157,7 +164,18 @@ def check(parser, options):
         for name in ("model", "classes"):
             if not getattr(options, name):
                 parser.error("--images needs --" + name)
-        for name in ("rig", "truth", "clouds", "fit_on", "live", "masks", "map", "paper", "bounds"):
+        for name in (
+            "rig",
+            "truth",
+            "clouds",
+            "fit_on",
+            "live",
+            "masks",
+            "map",
+            "paper",
+            "bounds",
+            "compare",
+        ):
             if getattr(options, name):
                 parser.error("--images and --%s exclude each other" % name.replace("_", "-"))
     elif not options.rig and not options.clouds:
@@ -193,7 +211,7 @@ def main():
     from semantic_lidar_fusion.evaluation import run
 
     values = dict(vars(options))
-    for name in ("bags", "settings"):
+    for name in ("bags", "settings", "compare"):
         values[name] = tuple(values[name])
     values["clouds"] = tuple(tuple(text.split("=", 1)) for text in options.clouds)
     print(run.evaluate(run.Options(**values)))

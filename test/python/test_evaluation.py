@@ -114,7 +114,8 @@ def test_scores_by_hand(rig, run_command, tmp_path):
     assert float(counts["nll"]) == pytest.approx(2 * 12 * np.log(10) / 4)
     with open(str(out / "confusion_mine.csv")) as file:
         assert file.read() == "truth,road,wall,(discarded)\nroad,1,1,0\nwall,0,1,1\n"
-    for name in ("f1.png", "confusion.png", "reliability.png", "report.md"):
+    names = ("f1.png", "confusion.png", "reliability.png", "report.md", "report.html", "tables.tex")
+    for name in names:
         assert os.path.getsize(str(out / name)) > 100
     assert "| Road" in text
     code, _, err = run_command("evaluate.py", known, "--clouds", "mine=%s" % made, "--out", out)

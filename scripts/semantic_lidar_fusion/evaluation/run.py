@@ -9,7 +9,7 @@ from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tu
 
 from semantic_lidar_fusion.bags.bag_io import BagReader, write_text
 from semantic_lidar_fusion.errors import DataError
-from semantic_lidar_fusion.evaluation import image_truth, scoring, tables
+from semantic_lidar_fusion.evaluation import html_report, image_truth, scoring, tables
 from semantic_lidar_fusion.evaluation.calibration import Variant
 from semantic_lidar_fusion.evaluation.metrics import Visibility
 from semantic_lidar_fusion.evaluation.scoring import (
@@ -25,6 +25,8 @@ from semantic_lidar_fusion.labels import LabelSet
 from semantic_lidar_fusion.rig import Rig, find_fuse_bag
 
 REPORT = "report.md"
+PAGE = "report.html"
+LATEX = "tables.tex"
 
 
 class Results:
@@ -34,6 +36,8 @@ class Results:
         self.sections: List[str] = []
         self.files: Dict[str, str] = {}
         self.plots: List[Tuple[str, Callable[..., None], Tuple[Any, ...]]] = []
+        # A fused bag to show in the page, and the frame in which its scans are laid over each other.
+        self.shown: Optional[Tuple[str, str, LabelSet]] = None
 
     def add_scores(self, scores: Sequence[Score], rates: Dict[str, Visibility]) -> None:
         """rates: what the masks of the configurations catch and lose, by name."""
@@ -59,6 +63,13 @@ class Results:
             self.plots.append(("f1_star.png", plotting.draw_f1, (rows, shown, stars, "F1*")))
         self.plots.append(("confusion.png", plotting.draw_confusions, (rows, shown, confusions)))
         self.plots.append(("reliability.png", plotting.draw_reliability, (reliabilities,)))
+
+    def add_comparison(self, first: Score, second: Score) -> None:
+        self.sections += [
+            "## %s and %s\n" % (first.name, second.name),
+            "F1, and its difference with the 95 % interval over blocks of scans (paired).\n",
+            tables.compare(first, second),
+        ]
 
     def add_drives(self, drives: Sequence[Tuple[str, Sequence[Score]]]) -> None:
         names = ", ".join(score.name for score in drives[0][1])
@@ -97,8 +108,18 @@ class Results:
         for name, draw, arguments in self.plots:
             draw(os.path.join(folder, name), *arguments)
         write_text(os.path.join(folder, REPORT), report)
-        names = [REPORT] + sorted(self.files) + [name for name, _, _ in self.plots]
+        write_text(os.path.join(folder, LATEX), tables.latex(self.sections))
+        write_text(os.path.join(folder, PAGE), self._page(folder, title, report))
+        names = [REPORT, PAGE, LATEX] + sorted(self.files) + [name for name, _, _ in self.plots]
         return report + "\nwritten to %s: %s" % (folder, ", ".join(names))
+
+    def _page(self, folder: str, title: str, report: str) -> str:
+        """Report, plots and the shown bag as one HTML file."""
+        parts = [html_report.from_markdown(report)]
+        parts += [html_report.picture(os.path.join(folder, p[0]), p[0][:-4]) for p in self.plots]
+        if self.shown is not None:
+            parts += html_report.bag_parts(*self.shown)
+        return html_report.page(title, parts)
 
 
 @dataclass(frozen=True)
@@ -117,6 +138,7 @@ class Options:
     truth: Optional[str] = None
     paper: bool = False
     bounds: bool = False
+    compare: Tuple[str, ...] = ()
     min_edge_px: float = 0.0
     masks: bool = False
     fit_temperature: bool = False
@@ -226,7 +248,11 @@ def _evaluate_drives(options: Options, results: Results, workspace: str) -> str:
         columns = _columns(options, fuser, bag, truth, prefix)
         scores = [_score(options, column, truth, labels, rates) for column in columns]
         drives.append((_name(bag), scores))
-    results.add_scores(_sum(drives), rates)
+    total = _sum(drives)
+    results.add_scores(total, rates)
+    results.shown = (columns[-1].path, rig.text("fixed_frame") if rig else "odom", labels)
+    if options.compare:
+        results.add_comparison(*_chosen(total, options.compare))
     if len(drives) > 1:
         results.add_drives(drives)
     if options.live:
@@ -296,6 +322,15 @@ def _sum(drives: Sequence[Tuple[str, Sequence[Score]]]) -> List[Score]:
         for target, score in zip(total, scores):
             target.merge(score)
     return total
+
+
+def _chosen(scores: Sequence[Score], names: Sequence[str]) -> List[Score]:
+    """The scores of these configurations."""
+    known = {score.name: score for score in scores}
+    for name in names:
+        if name not in known:
+            raise DataError("--compare %s: the columns are %s" % (name, ", ".join(known)))
+    return [known[name] for name in names]
 
 
 def _evaluate_masks(options: Options, results: Results, workspace: str) -> str:

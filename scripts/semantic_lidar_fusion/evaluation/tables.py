@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""The evaluation's results as Markdown and CSV."""
+"""The evaluation's results as Markdown, CSV and LaTeX."""
 
 import csv
 import io
 import math
-from typing import Any, Dict, List, Sequence, Tuple
+import re
+from typing import Any, Callable, Dict, List, Sequence, Tuple
 
+import numpy as np
+
+from semantic_lidar_fusion.errors import DataError
+from semantic_lidar_fusion.evaluation import bootstrap
 from semantic_lidar_fusion.evaluation.calibration import Variant
 from semantic_lidar_fusion.evaluation.scoring import STATUS_NAMES, Score
-from semantic_lidar_fusion.evaluation.metrics import Visibility, mean_over_rows, ratio
+from semantic_lidar_fusion.evaluation.metrics import Confusion, Visibility, mean_over_rows, ratio
 from semantic_lidar_fusion.figures.plotting import title_of
 
 
@@ -71,6 +76,68 @@ def table_one(scores: Sequence[Score]) -> str:
     if absent:
         text += "\nNeither in the truth nor predicted: %s.\n" % ", ".join(absent)
     return text
+
+
+def compare(first: Score, second: Score) -> str:
+    """Paired differences of F1, second minus first, with 95 % intervals: both are drawn anew from the
+    same blocks of scans. DataError if they are not of the same scans."""
+    if len(first.by_scan) != len(second.by_scan):
+        raise DataError(
+            "%s has %d scans, %s %d: only equal scans can be compared in pairs"
+            % (first.name, len(first.by_scan), second.name, len(second.by_scan))
+        )
+    both = np.array([[a.fused, b.fused] for a, b in zip(first.by_scan, second.by_scan)])
+
+    def f1_of(matrix: np.ndarray) -> np.ndarray:
+        confusion = Confusion(len(first.rows))
+        confusion.matrix = matrix
+        return confusion.f1
+
+    def row(name: str, score: Callable[[np.ndarray], float]) -> List[str]:
+        total = both.sum(axis=0)
+        low, high = bootstrap.interval(both, lambda pair: score(pair[1]) - score(pair[0]))
+        values = [score(total[0]), score(total[1]), score(total[1]) - score(total[0]), low, high]
+        return [name] + [number(value) for value in values]
+
+    def of_class(index: int) -> Callable[[np.ndarray], float]:
+        return lambda matrix: float(f1_of(matrix)[index])
+
+    rows = [
+        row(title_of(first.rows[index]), of_class(index)) for index in present_rows([first, second])
+    ]
+    rows.append(row("mean", lambda matrix: mean_over_rows(f1_of(matrix))))
+    return markdown(["class", first.name, second.name, "difference", "95 % from", "to"], rows)
+
+
+def latex(sections: Sequence[str]) -> str:
+    """The tables of a Markdown report as LaTeX (booktabs), each under its heading."""
+    parts: List[str] = []
+    heading = ""
+    for block in re.split(r"\n\s*\n", "\n".join(sections)):
+        lines = [line for line in block.strip().split("\n") if line]
+        if lines and lines[0].startswith("#"):
+            heading = lines[0].lstrip("# ")
+            lines = lines[1:]
+        if len(lines) > 2 and lines[0].startswith("|"):
+            rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+            parts.append(_tabular(heading, rows[0], rows[2:]))
+    return "% \\usepackage{booktabs}\n" + "\n".join(parts)
+
+
+def _tabular(heading: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    def line(cells: Sequence[str]) -> str:
+        return " & ".join(map(_escaped, cells)) + r" \\"
+
+    body = [line(header), r"\midrule"] + [line(row) for row in rows]
+    return "\n".join(
+        ["% " + heading, r"\begin{tabular}{l%s}" % ("r" * (len(header) - 1)), r"\toprule"]
+        + body
+        + [r"\bottomrule", r"\end{tabular}", ""]
+    )
+
+
+def _escaped(text: str) -> str:
+    return re.sub(r"([&%$#_{}])", r"\\\1", text)
 
 
 def f1_star(scores: Sequence[Score]) -> str:
