@@ -262,8 +262,8 @@ def test_visible_points_fall_on_their_class(tmp_path, shutter, options):
 
 
 def test_odometry_errs_as_it_is_told(tmp_path):
-    """Velocity and rate errors are Ornstein-Uhlenbeck processes: of steps of 10 ms, their standard
-    deviation and the correlation of one with the next."""
+    """Velocity and rate errors are Ornstein-Uhlenbeck processes: what they add up to in 10 ms has the
+    standard deviation and the correlation of one with the next that the process's integral has."""
     bag, tau = str(tmp_path / "drift.bag"), 0.01
     done = simulate(
         bag, "--duration", "0.2", "--scale", "0.1", "--odometry-error", "0.3,2,%g" % tau
@@ -286,12 +286,14 @@ def test_odometry_errs_as_it_is_told(tmp_path):
         values.append(np.r_[believed[:3, 3] - step[:3, 3], turn] / 0.01)
     values = np.array(values)  # (readings - 1, 6)
     assert len(values) == 100
-    kept = np.exp(-0.01 / tau)
-    # Of 300 values with correlation k, the spread of the deviation is that of
-    # 300 (1 - k^2) / (1 + k^2) independent ones; four of its standard deviations.
-    independent = 300 * (1 - kept**2) / (1 + kept**2)
+    x = 0.01 / tau
+    variance = 2 * (x - 1 + np.exp(-x)) / x**2
+    kept = (1 - np.exp(-x)) ** 2 / x**2 / variance
+    # Correlations fall by exp(-x) a step. Of 300 values, the spread of the mean square is that of
+    # fewer independent ones; four of its standard deviations.
+    independent = 300 / (1 + 2 * kept**2 / (1 - np.exp(-2 * x)))
     for part, size in ((values[:, :3], 0.3), (values[:, 3:], np.radians(2))):
-        assert abs(np.sqrt(np.mean(part**2)) / size - 1) < 4 / np.sqrt(2 * independent)
+        assert abs(np.sqrt(np.mean(part**2) / variance) / size - 1) < 4 / np.sqrt(2 * independent)
         following = np.mean(part[1:] * part[:-1]) / np.mean(part**2)
         assert abs(following - kept) < 4 / np.sqrt(297)
 

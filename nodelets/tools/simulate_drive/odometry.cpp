@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 #include "tools/simulate_drive/odometry.h"
 
+#include <algorithm>
 #include <cmath>
 
 namespace semantic_lidar_fusion {
@@ -60,23 +61,45 @@ Transform Odometry::nextOfWheels(double time_s) {
   return T;
 }
 
+double Odometry::twistSigma(int axis) const {
+  return axis < 3 ? errors_.velocity_mps : errors_.rate_dps * kRadPerDeg;
+}
+
+Eigen::Matrix<double, 6, 1> Odometry::firstTwistError() {
+  for (int i = 0; i < 6; ++i) twist_error_[i] = twistSigma(i) * random_.normal();
+  return Eigen::Matrix<double, 6, 1>::Zero();
+}
+
+Eigen::Matrix<double, 6, 1> Odometry::wayOfTwistError(double dt) {
+  // Value and integral after dt are jointly normal given the value before. Of a process of unit
+  // variance: variances of what is fresh in both, and their covariance.
+  const double tau = errors_.correlation_s;
+  const double kept = std::exp(-dt / tau);
+  const double value_variance = 1.0 - kept * kept;
+  const double way_variance = tau * tau * (2.0 * dt / tau - 3.0 + kept * (4.0 - kept));
+  const double covariance = tau * (1.0 - kept) * (1.0 - kept);
+  const double fresh = std::sqrt(value_variance), common = covariance / fresh;
+  const double own = std::sqrt(std::max(way_variance - common * common, 0.0));
+  Eigen::Matrix<double, 6, 1> way;
+  for (int i = 0; i < 6; ++i) {
+    const double draw = random_.normal(), other = random_.normal();
+    way[i] = tau * (1.0 - kept) * twist_error_[i] + twistSigma(i) * (common * draw + own * other);
+    twist_error_[i] = kept * twist_error_[i] + twistSigma(i) * fresh * draw;
+  }
+  return way;
+}
+
 Transform Odometry::nextOfTwist(double time_s) {
   const Transform truth = path_.pose(time_s);
   const double dt = time_s - last_s_;
-  // Exact steps of the process; the first value is one of its own.
-  const double kept = started_ ? std::exp(-dt / errors_.correlation_s) : 0.0;
-  const double fresh = std::sqrt(1.0 - kept * kept);
-  for (int i = 0; i < 6; ++i) {
-    const double size = i < 3 ? errors_.velocity_mps : errors_.rate_dps * kRadPerDeg;
-    twist_error_[i] = kept * twist_error_[i] + fresh * size * random_.normal();
-  }
+  const Eigen::Matrix<double, 6, 1> error = started_ ? wayOfTwistError(dt) : firstTwistError();
   if (!started_) {
     believed_ = truth;
     started_ = true;
   } else {
     Transform step = last_true_.inverse() * truth;
-    const Eigen::Vector3d turn = dt * twist_error_.tail<3>();
-    step.translation() += dt * twist_error_.head<3>();
+    const Eigen::Vector3d turn = error.tail<3>();
+    step.translation() += error.head<3>();
     if (!turn.isZero(0.0)) {
       step.linear() =
           step.linear() * Eigen::AngleAxisd(turn.norm(), turn.normalized()).toRotationMatrix();

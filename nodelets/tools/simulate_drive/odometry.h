@@ -12,6 +12,8 @@ namespace simulator {
 /// Dead reckoning that begins at the true pose: from wheel speed and yaw rate, or, with errors of
 /// odometry given, from the true motion of the body with a velocity and a rate added. Each of these
 /// six is an Ornstein-Uhlenbeck process: normal, with autocorrelation exp(-|t| / correlation_s).
+/// The readings integrate it exactly, so that what it adds up to over a time D has the variance
+/// sigma^2 2 tau^2 (D / tau - 1 + exp(-D / tau)) for every correlation time tau.
 class Odometry {
  public:
   Odometry(const DrivePath& path, const ErrorSizes& errors, std::uint64_t seed, bool exact);
@@ -22,6 +24,10 @@ class Odometry {
  private:
   Transform nextOfWheels(double time_s);
   Transform nextOfTwist(double time_s);
+  double twistSigma(int axis) const;
+  Eigen::Matrix<double, 6, 1> firstTwistError();
+  /// Moves the error on by dt; its integral over that time, m and rad.
+  Eigen::Matrix<double, 6, 1> wayOfTwistError(double dt);
 
   const DrivePath& path_;
   ErrorSizes errors_;
