@@ -261,6 +261,64 @@ def test_visible_points_fall_on_their_class(tmp_path, shutter, options):
     assert shutter[0] == 0 or told_wrong > 5 * wrong + 0.003 * checked
 
 
+LENS = """model: omni
+resolution: [384, 240]
+focal: [400.0, 399.0]
+centre: [191.3, 119.2]
+coefficients: [1.2, -0.05, 0.01, 0.0004, -0.0004]
+"""
+
+
+def test_lens_and_shutter_of_the_rig_are_those_of_the_drive(tmp_path):
+    """A drive through a lens that camera_info cannot name, its rows exposed one after another: fused
+    with both told, every point that a camera sees more than a pixel from an edge gets its label; with
+    the shutter left out, turned round or stamped elsewhere many do not, and with the lens left out
+    nothing is fused."""
+    lens, bag = tmp_path / "lens.yaml", tmp_path / "drive.bag"
+    lens.write_text(LENS)
+    options = ["--lens", str(lens), "--readout", "0.04", "--stamp-row", "middle", "--speed", "15"]
+    done = simulate(bag, "--duration", "0.2", "--static", "--exact", *options)
+    assert done.returncode == 0, done.stderr
+    info = read(bag, "/gmsl/B0/camera_info")[0]
+    assert (info.width, info.height, info.distortion_model) == (384, 240, "omni")
+    truths = [cloud_io.to_array(m) for m in read(bag, "/points_truth")]
+    rig = os.path.join(os.path.dirname(os.path.abspath(__file__)), "../../config/demo.yaml")
+
+    def fuse(*keys):
+        out = str(tmp_path / "fused.bag")
+        overrides = ["occlusion.mode=off"]
+        overrides += ["cameras.%s.%s" % (name, key) for name in CAMERAS for key in keys]
+        arguments = [str(bag), out, "--rig", rig, "--quiet", "--force"]
+        for override in overrides:
+            arguments += ["--set", override]
+        program = os.path.join(os.path.dirname(PROGRAM), "fuse_bag")
+        return out, subprocess.run([program] + arguments, capture_output=True, text=True)
+
+    def wrong(*keys):
+        """The share with another label, of the points that are labelled by those cameras that see
+        them (no mask is on) and lie beyond the pixels of an edge."""
+        out, ran = fuse("lens.file=%s" % lens, *keys)
+        assert ran.returncode == 0, ran.stderr
+        count = missed = 0
+        for truth, message in zip(truths, read(out, "/points_semantic")):
+            cloud = cloud_io.to_array(message)
+            seen = (cloud["status"] == 0) & (cloud["cameras"] == truth["visible"])
+            seen &= truth["edge_px"] > 1
+            count += seen.sum()
+            missed += (seen & (cloud["label"] != truth["label"])).sum()
+        assert count > 30000
+        return missed / count
+
+    shutter = ["shutter.readout_s=0.04", "shutter.stamp_row=middle"]
+    right = wrong(*shutter)
+    assert right < 5e-4
+    assert wrong() > right + 0.003
+    assert wrong(*(shutter + ["shutter.direction=up"])) > right + 0.009
+    assert wrong("shutter.readout_s=0.04") > right + 0.03
+    _, ran = fuse()
+    assert ran.returncode == 1 and "omni" in ran.stderr
+
+
 def test_odometry_errs_as_it_is_told(tmp_path):
     """Velocity and rate errors are Ornstein-Uhlenbeck processes: what they add up to in 10 ms has the
     standard deviation and the correlation of one with the next that the process's integral has."""
@@ -428,6 +486,8 @@ def test_wrong_command_lines_are_named(tmp_path):
         (["--stamp-row", "2"], ["--stamp-row", "'2'", "first, middle, last"]),
         (["--extrinsic-error", "1"], ["--extrinsic-error", "'1'", "2 numbers"]),
         (["--odometry-error", "1,1,0"], ["--odometry-error", "correlation time"]),
+        (["--lens", "no.yaml", "--scale", "0.5"], ["--scale", "--lens"]),
+        (["--lens-camera", "cam0"], ["--lens-camera", "--lens FILE"]),
         (["--nonsense"], ["--nonsense"]),
         (["--seed"], ["--seed", "value"]),
     ):

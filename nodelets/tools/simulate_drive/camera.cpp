@@ -7,7 +7,6 @@
 #include <opencv2/imgproc.hpp>
 #include <thread>
 
-#include "semantic_lidar_fusion/common/error.h"
 #include "tools/simulate_drive/materials.h"
 #include "tools/simulate_drive/noise.h"
 
@@ -154,8 +153,11 @@ class Rendering {
         picture_{cv::Mat(height_, width_, CV_8UC3), cv::Mat(height_, width_, CV_8UC1), {}} {}
 
   void lookOnce(int row, int column, const Eigen::Isometry3f& eye) {
-    samples_[at(row, column)] =
-        look(world_, eye.translation(), eye.linear() * camera_.ray(row, column));
+    const Vector3f& ray = camera_.ray(row, column);
+    // Beyond the lens's valid domain the sensor is dark.
+    samples_[at(row, column)] = ray.isZero(0.0F)
+                                    ? Sample{Vector3f::Zero(), Class::kUnlabeled, Sight()}
+                                    : look(world_, eye.translation(), eye.linear() * ray);
   }
 
   /// After all of lookOnce().
@@ -163,7 +165,7 @@ class Rendering {
     const Sample& sample = samples_[at(row, column)];
     Vector3f light = sample.light;
     // Edges take three more samples inside of the pixel; its label stays that of the centre.
-    if (isEdge(row, column)) {
+    if (isEdge(row, column) && lensCoversAround(row, column)) {
       addAround(row, column, eye, &light);
       light *= 0.25F;
     }
@@ -206,6 +208,14 @@ class Rendering {
            (row + 1 < height_ && differs(samples_[at(row + 1, column)]));
   }
 
+  bool lensCoversAround(int row, int column) const {
+    const int left = std::min(column + 1, width_ - 1) - 1;
+    const int top = std::min(row + 1, height_ - 1) - 1;
+    const auto covers = [&](int y, int x) { return !camera_.ray(y, x).isZero(0.0F); };
+    return covers(row, column) && covers(row, left) && covers(row, left + 1) &&
+           covers(top, column) && covers(top + 1, column);
+  }
+
   /// Adds three more rays through a pixel.
   void addAround(int row, int column, const Eigen::Isometry3f& eye, Vector3f* light) const {
     const int left = std::min(column + 1, width_ - 1) - 1;
@@ -230,15 +240,18 @@ class Rendering {
 
 }  // namespace
 
-Camera::Camera(const CameraInfo& info, const Transform& T_base_camera)
-    : info_(info), model_(info, {}), T_base_camera_(T_base_camera) {
+Camera::Camera(const CameraInfo& info, const std::shared_ptr<const LensCalibration>& lens,
+               const Transform& T_base_camera)
+    : info_(info), T_base_camera_(T_base_camera) {
+  CameraModelOptions options;
+  options.lens = lens;
+  model_ = std::make_shared<const CameraModel>(info, options);
   rays_.reserve(static_cast<std::size_t>(info.size.width) *
                 static_cast<std::size_t>(info.size.height));
   for (int row = 0; row < info.size.height; ++row) {
     for (int column = 0; column < info.size.width; ++column) {
-      const std::optional<Eigen::Vector3d> ray = model_.ray({column, row});
-      if (!ray) throw Error("a pixel of the simulated lens has no ray");
-      rays_.push_back(ray->cast<float>());
+      const std::optional<Eigen::Vector3d> ray = model_->ray({column, row});
+      rays_.push_back(ray ? Eigen::Vector3f(ray->cast<float>()) : Eigen::Vector3f::Zero());
     }
   }
 }

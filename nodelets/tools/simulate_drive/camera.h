@@ -4,6 +4,7 @@
 
 #include <Eigen/Core>
 #include <cstdint>
+#include <memory>
 #include <opencv2/core.hpp>
 #include <vector>
 
@@ -31,25 +32,28 @@ struct Picture {
 
 class Camera {
  public:
-  Camera(const CameraInfo& info, const Transform& T_base_camera);
+  /// `lens`: in place of what the camera_info says; null = none.
+  Camera(const CameraInfo& info, const std::shared_ptr<const LensCalibration>& lens,
+         const Transform& T_base_camera);
 
   /// Each line at its own time. Moves the world's instant. The same bytes for every number of
   /// threads.
   Picture render(const DrivePath& path, const Exposure& exposure, std::uint64_t key, int threads,
                  World* world) const;
 
-  /// Unit vector through a pixel's middle, in the camera's frame.
+  /// Unit vector through a pixel's middle, in the camera's frame; zero where the lens has no ray.
   const Eigen::Vector3f& ray(int row, int column) const {
     return rays_[static_cast<std::size_t>(row) * static_cast<std::size_t>(info_.size.width) +
                  static_cast<std::size_t>(column)];
   }
   const CameraInfo& info() const { return info_; }
-  const CameraModel& model() const { return model_; }
+  const CameraModel& model() const { return *model_; }
+  std::shared_ptr<const CameraModel> sharedModel() const { return model_; }
   const Transform& T_base_camera() const { return T_base_camera_; }
 
  private:
   CameraInfo info_;
-  CameraModel model_;
+  std::shared_ptr<const CameraModel> model_;
   Transform T_base_camera_;
   std::vector<Eigen::Vector3f> rays_;  ///< by row
 };

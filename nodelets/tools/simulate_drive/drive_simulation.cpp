@@ -110,15 +110,9 @@ class Simulation {
       : options_(options),
         checkpoint_(checkpoint),
         path_(options.duration_s, options.speed_mps),
-        cameras_(makeCameras(options.scale, options.camera_drop_m)),
         errors_(options.errors, options.seed),
-        odometry_(path_, options.errors, options.seed, options.exact_odometry) {
-    for (std::size_t c = 0; c < cameras_.size(); ++c) {
-      MountedCamera& mounted = cameras_[c];
-      mounted.camera = Camera(errors_.realInfo(mounted.said_info, c, options.scale),
-                              mounted.T_base_said * errors_.ofPose(c));
-    }
-  }
+        cameras_(makeCameras(options.optics, options.camera_drop_m, errors_)),
+        odometry_(path_, options.errors, options.seed, options.exact_odometry) {}
 
   void run() {
     BagOutput bag(options_.output, "simulate_drive",
@@ -214,9 +208,7 @@ class Simulation {
         if (!sweeps) break;
         const Transform T_camera_lidar = mounted.T_base_said.inverse() * lidarPose();
         scan.sweep_ns.push_back(
-            sweepTime(scans_[i].cloud,
-                      {std::make_shared<CameraModel>(mounted.said_info, CameraModelOptions{}),
-                       T_camera_lidar}));
+            sweepTime(scans_[i].cloud, {mounted.said.sharedModel(), T_camera_lidar}));
       }
       selector.addScan(scan, scans_[i].record_ns);
       take(selector.advance(scans_[i].record_ns));
@@ -278,7 +270,7 @@ class Simulation {
       const Transform T = errors_.ofPose(c);
       const Eigen::AngleAxisd turn(T.linear());
       const Eigen::Vector3d rotation = turn.angle() * turn.axis();
-      const CameraInfo& info = cameras_[c].camera.info();
+      const CameraInfo& info = cameras_[c].real.info();
       text << (c == 0 ? "\"" : ", \"") << cameras_[c].name << "\": {";
       list("translation_m", T.translation(), 3);
       text << ", ";
@@ -411,7 +403,7 @@ class Simulation {
   void renderImages(StampNs stamp, BagOutput* bag) {
     const auto found = used_.find(stamp);
     for (std::size_t c = 0; c < cameras_.size(); ++c) {
-      const Camera& camera = cameras_[c].camera;
+      const Camera& camera = cameras_[c].real;
       const bool used = found != used_.end() && found->second.count(static_cast<int>(c)) != 0;
       if (!used && !options_.all_images) continue;
       const std::uint64_t key = mixKeys(options_.seed, static_cast<std::uint64_t>(stamp), c);
@@ -426,8 +418,8 @@ class Simulation {
       const cv::Mat scores =
           options_.perfect_network
               ? perfectScores(picture.labels)
-              : imitateNetwork(picture, {kFullWidth / kScoreStride, kFullHeight / kScoreStride},
-                               1.0 / camera.info().k[0], {options_.seed, key});
+              : imitateNetwork(picture, scoreSize(), 1.0 / camera.model().axialFocalX(),
+                               {options_.seed, key});
       bag->write(ns + "/scores", stamp + kScoreDelayNs, *imageMessage(scores, header));
       savePicture(c, picture);
       const cv::Mat edges = distanceToClassEdge(picture.labels);
@@ -435,6 +427,12 @@ class Simulation {
         lookForPoints(c, exposure, picture.labels, edges, &scans_[scan]);
       }
     }
+  }
+
+  ImageSize scoreSize() const {
+    const ImageSize full =
+        options_.optics.lens ? options_.optics.lens->size : ImageSize{kFullWidth, kFullHeight};
+    return {std::max(full.width / kScoreStride, 1), std::max(full.height / kScoreStride, 1)};
   }
 
   void writeImage(const Picture& picture, const std::string& ns, StampNs stamp,
@@ -504,7 +502,7 @@ class Simulation {
   /// Marks the points of a scan that the camera sees, by a ray to where each is when it is exposed.
   void lookForPoints(std::size_t c, const Exposure& exposure, const cv::Mat& labels,
                      const cv::Mat& edges, Scan* scan) {
-    const Camera& camera = cameras_[c].camera;
+    const Camera& camera = cameras_[c].real;
     const ReturnsAround returns(scan->simulated, path_, lidarPose(), kStartNs, exposure.time());
     const auto mark = [c](std::uint16_t* bits, bool set) {
       if (set) *bits = static_cast<std::uint16_t>(*bits | (1U << c));
@@ -535,8 +533,8 @@ class Simulation {
   const SimulationOptions& options_;
   void (*checkpoint_)();
   DrivePath path_;
-  std::vector<MountedCamera> cameras_;
   DrawnErrors errors_;
+  std::vector<MountedCamera> cameras_;
   Odometry odometry_;
   World world_;
   std::vector<Scan> scans_;

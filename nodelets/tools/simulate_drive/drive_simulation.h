@@ -9,6 +9,7 @@
 #include "tools/common/command_line.h"
 #include "tools/simulate_drive/errors.h"
 #include "tools/simulate_drive/exposure.h"
+#include "tools/simulate_drive/rig.h"
 
 namespace semantic_lidar_fusion {
 namespace simulator {
@@ -18,7 +19,7 @@ struct SimulationOptions : CommonOptions {
   double duration_s = 2.0;
   double speed_mps = 10.0;
   std::uint64_t seed = 1;
-  double scale = 0.5;          ///< of 1920 x 1208 pixels
+  Optics optics;               ///< of all cameras
   double camera_drop_m = 0.2;  ///< of the cameras below the lidar
   double image_rate_hz = 30.0;
   bool moving = true;  ///< other road users move

@@ -27,18 +27,18 @@ Transform DrawnErrors::ofPose(std::size_t camera) const {
   return T;
 }
 
-CameraInfo DrawnErrors::realInfo(const CameraInfo& said, std::size_t camera, double scale) const {
-  CameraInfo info = said;
-  if (sizes_.focal_share <= 0.0 && sizes_.centre_px <= 0.0) return info;
+Intrinsics DrawnErrors::real(const Intrinsics& said, std::size_t camera, double scale) const {
+  Intrinsics lens = said;
+  if (sizes_.focal_share <= 0.0 && sizes_.centre_px <= 0.0) return lens;
   Random random(mixKeys(seed_, kLenses, camera));
   const double stretch = 1.0 + sizes_.focal_share * random.normal();
   const double right = sizes_.centre_px * scale * random.normal();
   const double down = sizes_.centre_px * scale * random.normal();
-  info.k[0] *= stretch;
-  info.k[4] *= stretch;
-  info.k[2] += right;
-  info.k[5] += down;
-  return info;
+  lens.fx *= stretch;
+  lens.fy *= stretch;
+  lens.cx += right;
+  lens.cy += down;
+  return lens;
 }
 
 double DrawnErrors::ofStamp(StampNs stamp, std::size_t camera) const {

@@ -3,10 +3,7 @@
 #pragma once
 
 #include <cstdint>
-#include <string>
-#include <vector>
 
-#include "semantic_lidar_fusion/camera/camera_model.h"
 #include "semantic_lidar_fusion/common/types.h"
 
 namespace semantic_lidar_fusion {
@@ -25,6 +22,11 @@ struct ErrorSizes {
   bool ofOdometry() const { return velocity_mps > 0.0 || rate_dps > 0.0; }
 };
 
+/// What of a lens is told wrong, px.
+struct Intrinsics {
+  double fx = 1.0, fy = 1.0, cx = 0.0, cy = 0.0;
+};
+
 class DrawnErrors {
  public:
   DrawnErrors(const ErrorSizes& sizes, std::uint64_t seed) : sizes_(sizes), seed_(seed) {}
@@ -32,8 +34,8 @@ class DrawnErrors {
   /// T_said_real of a camera: where it really is, in the frame that tf gives it. A pose's error is
   /// [translation; rotation vector] in that frame.
   Transform ofPose(std::size_t camera) const;
-  /// The real lens behind a camera_info; `scale`: of full-size images.
-  CameraInfo realInfo(const CameraInfo& said, std::size_t camera, double scale) const;
+  /// A lens as it really is, px of images `scale` times full size.
+  Intrinsics real(const Intrinsics& said, std::size_t camera, double scale) const;
   /// How much later than its stamp an image is exposed, s.
   double ofStamp(StampNs stamp, std::size_t camera) const;
 

@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: MIT
 /// simulate_drive: a drive of known truth as a bag. See kUsage.
+#include <cmath>
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -41,6 +43,9 @@ options:
   --seed N             another street, other noise (default 1)
   --scale F            image size, 0.1 to 1 times 1920 x 1208 (default 0.5)
   --width PIXELS       the same, by the images' width
+  --lens FILE          all cameras look through this lens, a file that the rig's cameras[].lens
+                       reads; images have its resolution. Name it in the rig, too
+  --lens-camera NAME   the entry of a file of several cameras
   --camera-drop M      cameras below the lidar, -1 to 1.2 (default 0.2); also --lidar-offset
   --image-rate HZ      1 to 100 (default 30)
   --images all|selected  also render images that no scan uses (default selected)
@@ -76,14 +81,39 @@ void addVehicleOptions(OptionReader* reader, SimulationOptions* options) {
   reader->number("--duration", 0.2, 300.0, &options->duration_s);
   reader->number("--speed", 5.0, 15.0, &options->speed_mps);
   reader->wholeNumber("--seed", 0.0, 1e15, &options->seed);
-  reader->number("--scale", 0.1, 1.0, &options->scale);
-  reader->value("--width", [options](const std::string& width) {
-    options->scale = wholeNumberOf("--width", width, 192.0, kFullWidth) / kFullWidth;
-  });
   reader->number("--camera-drop", -1.0, 1.2, &options->camera_drop_m);
   reader->number("--lidar-offset", -1.0, 1.2, &options->camera_drop_m);
   reader->number("--image-rate", 1.0, 100.0, &options->image_rate_hz);
 }
+
+/// How large the images are, and the lens.
+struct OpticsChoice {
+  double scale = NAN;  ///< not given
+  std::string lens_file, lens_camera;
+
+  void addTo(OptionReader* reader) {
+    reader->number("--scale", 0.1, 1.0, &scale);
+    reader->value("--width", [this](const std::string& width) {
+      scale = wholeNumberOf("--width", width, 192.0, kFullWidth) / kFullWidth;
+    });
+    reader->text("--lens", &lens_file);
+    reader->text("--lens-camera", &lens_camera);
+  }
+
+  Optics optics() const {
+    Optics result;
+    if (!std::isnan(scale)) result.scale = scale;
+    if (lens_file.empty()) {
+      if (!lens_camera.empty()) throw UsageError("--lens-camera needs --lens FILE");
+      return result;
+    }
+    if (!std::isnan(scale)) {
+      throw UsageError("--scale and --width do not go with --lens, whose file gives the size");
+    }
+    result.lens = std::make_shared<const LensCalibration>(loadLens(lens_file, lens_camera));
+    return result;
+  }
+};
 
 void addShutterOptions(OptionReader* reader, Shutter* shutter) {
   reader->number("--readout", 0.0, 0.1, &shutter->readout_s);
@@ -111,6 +141,8 @@ SimulationOptions parseOptions(const std::vector<std::string>& arguments) {
   OptionReader reader(&options);
   reader.text("--out", &options.output);
   addVehicleOptions(&reader, &options);
+  OpticsChoice optics;
+  optics.addTo(&reader);
   reader.choice<bool>("--images", {{"all", true}, {"selected", false}}, &options.all_images);
   reader.choice<ImageChoice>("--image-choice",
                              {{"closest_to_reference", ImageChoice::kClosestToReference},
@@ -131,6 +163,7 @@ SimulationOptions parseOptions(const std::vector<std::string>& arguments) {
   if (!(options.errors.correlation_s > 0.0)) {
     throw UsageError("--odometry-error: the correlation time must be above 0");
   }
+  options.optics = optics.optics();
   options.moving = !standing;
   if (exact) {
     options.perfect_network = options.exact_odometry = true;
