@@ -99,11 +99,6 @@ cv::Mat eightBitImage(cv::Mat image) {
 /// Largest time between a compensated point and its cloud's stamp.
 constexpr float kMaxDt_s = 86400.0f;
 
-struct FieldLayout {
-  const char* name;
-  std::uint8_t datatype;
-};
-
 std::uint32_t sizeOf(std::uint8_t datatype) {
   switch (datatype) {
     case PointField::INT8:
@@ -148,12 +143,13 @@ sensor_msgs::PointCloud2Ptr cloudMessage(StampNs stamp, const std::string& frame
 }
 
 /// The field, checked to have the wanted type and to lie within the point; null if absent.
-const PointField* findField(const sensor_msgs::PointCloud2& message, const FieldLayout& wanted) {
+const PointField* findField(const sensor_msgs::PointCloud2& message, const std::string& name,
+                            std::uint8_t datatype) {
   for (const PointField& field : message.fields) {
-    if (field.name != wanted.name) continue;
-    if (field.datatype != wanted.datatype) {
+    if (field.name != name) continue;
+    if (field.datatype != datatype) {
       throw DataError("cloud field '" + field.name + "' has datatype " +
-                      std::to_string(field.datatype) + "; " + std::to_string(wanted.datatype) +
+                      std::to_string(field.datatype) + "; " + std::to_string(datatype) +
                       " is wanted");
     }
     if (static_cast<std::uint64_t>(field.offset) + sizeOf(field.datatype) > message.point_step) {
@@ -166,9 +162,9 @@ const PointField* findField(const sensor_msgs::PointCloud2& message, const Field
 }
 
 template <typename T>
-void readField(const sensor_msgs::PointCloud2& message, const FieldLayout& wanted,
+void readField(const sensor_msgs::PointCloud2& message, const std::string& name,
                std::vector<T>* values) {
-  const PointField* field = findField(message, wanted);
+  const PointField* field = findField(message, name, static_cast<std::uint8_t>(fieldType<T>()));
   if (!field || values->empty()) return;
   std::size_t i = 0;
   for (std::uint32_t row = 0; row < message.height; ++row) {
@@ -349,7 +345,7 @@ Cloud compensatedCloud(const sensor_msgs::PointCloud2& message) {
   const bool has_points = message.width > 0 && message.height > 0;
   for (const char* name : {"x", "y", "z"}) {
     // Before memory is taken: with a point_step of 0 any number of points fits no data at all.
-    if (has_points && !findField(message, {name, PointField::FLOAT32})) {
+    if (has_points && !findField(message, name, PointField::FLOAT32)) {
       throw DataError(std::string("cloud has no field '") + name + "'");
     }
   }
@@ -359,13 +355,8 @@ Cloud compensatedCloud(const sensor_msgs::PointCloud2& message) {
   std::fill(cloud.dt.begin(), cloud.dt.end(), 0.0f);
   std::fill(cloud.status.begin(), cloud.status.end(),
             static_cast<std::uint8_t>(PointStatus::kFused));
-  readField(message, {"x", PointField::FLOAT32}, &cloud.x);
-  readField(message, {"y", PointField::FLOAT32}, &cloud.y);
-  readField(message, {"z", PointField::FLOAT32}, &cloud.z);
-  readField(message, {"intensity", PointField::FLOAT32}, &cloud.intensity);
-  readField(message, {"ring", PointField::UINT16}, &cloud.ring);
-  readField(message, {"dt", PointField::FLOAT32}, &cloud.dt);
-  readField(message, {"status", PointField::UINT8}, &cloud.status);
+  visitCompensatedFields(
+      cloud, [&](const char* name, auto& values) { readField(message, name, &values); });
   for (std::size_t i = 0; i < cloud.size(); ++i) {
     if (!std::isfinite(cloud.x[i]) || !std::isfinite(cloud.y[i]) || !std::isfinite(cloud.z[i])) {
       throw DataError("cloud point " + std::to_string(i) + " is not finite");

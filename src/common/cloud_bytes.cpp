@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 #include "semantic_lidar_fusion/common/cloud_bytes.h"
 
+#include <algorithm>
 #include <array>
 #include <cstring>
 #include <limits>
@@ -21,13 +22,16 @@ std::uint32_t sizeOf(FieldType type) {
   }
 }
 
-/// Appends a field at its natural alignment and returns its offset.
-std::uint32_t addField(const std::string& name, FieldType type, CloudBytes* bytes) {
-  const std::uint32_t size = sizeOf(type);
-  const std::uint32_t offset = (bytes->point_step + size - 1) / size * size;
-  bytes->point_step = offset + size;
-  bytes->fields.push_back({name, type, offset});
-  return offset;
+/// Appends fields at their natural alignment; returns the first one's offset.
+std::uint32_t addFields(const CloudColumn& column, CloudBytes* bytes) {
+  const std::uint32_t size = sizeOf(column.type);
+  bytes->point_step = (bytes->point_step + size - 1) / size * size;
+  const std::uint32_t first = bytes->point_step;
+  for (const std::string& name : column.names) {
+    bytes->fields.push_back({name, column.type, bytes->point_step});
+    bytes->point_step += size;
+  }
+  return first;
 }
 
 void allocatePoints(std::size_t points, CloudBytes* bytes) {
@@ -39,98 +43,98 @@ void allocatePoints(std::size_t points, CloudBytes* bytes) {
   bytes->data.resize(size);
 }
 
-template <typename T>
-void put(const T& value, std::uint32_t offset, std::uint8_t* point) {
-  std::memcpy(point + offset, &value, sizeof(T));
+/// Copies `count` values of kBytes to places `step` bytes apart.
+template <std::size_t kBytes>
+void scatter(const std::uint8_t* values, std::size_t count, std::size_t step, std::uint8_t* to) {
+  for (std::size_t i = 0; i < count; ++i, values += kBytes, to += step) {
+    std::memcpy(to, values, kBytes);
+  }
 }
 
-struct CommonOffsets {
-  std::uint32_t x, y, z, intensity, ring, dt;
-};
-
-CommonOffsets addCommonFields(CloudBytes* bytes) {
-  CommonOffsets at{};
-  at.x = addField("x", FieldType::kFloat32, bytes);
-  at.y = addField("y", FieldType::kFloat32, bytes);
-  at.z = addField("z", FieldType::kFloat32, bytes);
-  at.intensity = addField("intensity", FieldType::kFloat32, bytes);
-  at.ring = addField("ring", FieldType::kUint16, bytes);
-  at.dt = addField("dt", FieldType::kFloat32, bytes);
-  return at;
+/// The column's values of points [first, first + count).
+void scatterColumn(const CloudColumn& column, std::size_t first, std::size_t count,
+                   std::size_t step, std::uint8_t* to) {
+  const std::size_t bytes = column.names.size() * sizeOf(column.type);
+  if (bytes == 0) return;
+  const std::uint8_t* values = column.values + first * bytes;
+  if (bytes == 1) return scatter<1>(values, count, step, to);
+  if (bytes == 2) return scatter<2>(values, count, step, to);
+  if (bytes == 4) return scatter<4>(values, count, step, to);
+  for (std::size_t i = 0; i < count; ++i) std::memcpy(to + i * step, values + i * bytes, bytes);
 }
 
-void putCommon(const Cloud& cloud, std::size_t i, const CommonOffsets& at, std::uint8_t* point) {
-  put(cloud.x[i], at.x, point);
-  put(cloud.y[i], at.y, point);
-  put(cloud.z[i], at.z, point);
-  put(cloud.intensity[i], at.intensity, point);
-  put(cloud.ring[i], at.ring, point);
-  put(cloud.dt[i], at.dt, point);
-}
-
-/// 0xRRGGBB by label.
-std::array<std::uint32_t, 256> colorsOf(const LabelSet& classes) {
-  std::array<std::uint32_t, 256> colors;
-  colors.fill(kNoClassRgb);
+/// 0xRRGGBB of each point.
+std::vector<std::uint32_t> colorsOf(const std::vector<std::uint8_t>& labels,
+                                    const LabelSet& classes) {
+  std::array<std::uint32_t, 256> color_of_label;
+  color_of_label.fill(kNoClassRgb);
   for (int id = 0; id < classes.size(); ++id) {
     const auto& color = classes[id].color_rgb;
-    colors[static_cast<std::size_t>(id)] = static_cast<std::uint32_t>(color[0]) << 16 |
-                                           static_cast<std::uint32_t>(color[1]) << 8 | color[2];
+    color_of_label[static_cast<std::size_t>(id)] = static_cast<std::uint32_t>(color[0]) << 16 |
+                                                   static_cast<std::uint32_t>(color[1]) << 8 |
+                                                   color[2];
   }
+  std::vector<std::uint32_t> colors(labels.size());
+  for (std::size_t i = 0; i < labels.size(); ++i) colors[i] = color_of_label[labels[i]];
   return colors;
+}
+
+CloudColumns compensatedColumns(const Cloud& cloud) {
+  CloudColumns columns;
+  visitCompensatedFields(cloud, [&](const char* name, const auto& values) {
+    columns.push_back(cloudColumn(name, values));
+  });
+  return columns;
 }
 
 }  // namespace
 
-CloudBytes compensatedCloudBytes(const Cloud& cloud) {
-  CloudBytes bytes;
-  const CommonOffsets common = addCommonFields(&bytes);
-  const std::uint32_t status = addField("status", FieldType::kUint8, &bytes);
-  allocatePoints(cloud.size(), &bytes);
-  std::uint8_t* point = bytes.data.data();
-  for (std::size_t i = 0; i < cloud.size(); ++i, point += bytes.point_step) {
-    putCommon(cloud, i, common, point);
-    put(cloud.status[i], status, point);
-  }
-  return bytes;
-}
-
-CloudBytes semanticCloudBytes(const SemanticCloud& cloud, const LabelSet& classes) {
+CloudColumns semanticColumns(const SemanticCloud& cloud, const LabelSet& classes) {
   if (cloud.class_count != classes.size()) {
     throw DataError("semantic cloud has " + std::to_string(cloud.class_count) +
                     " classes; the class set has " + std::to_string(classes.size()));
   }
-  CloudBytes bytes;
-  const CommonOffsets common = addCommonFields(&bytes);
-  const std::uint32_t rgb = addField("rgb", FieldType::kFloat32, &bytes);
-  const std::uint32_t label = addField("label", FieldType::kUint8, &bytes);
-  const std::uint32_t confidence = addField("confidence", FieldType::kFloat32, &bytes);
-  const std::uint32_t entropy = addField("entropy", FieldType::kFloat32, &bytes);
-  const std::uint32_t cameras = addField("cameras", FieldType::kUint16, &bytes);
-  const std::uint32_t status = addField("status", FieldType::kUint8, &bytes);
-  std::uint32_t first_class = 0;
+  CloudColumns columns = compensatedColumns(cloud.points);
+  const CloudColumn status = columns.back();
+  columns.pop_back();
+  columns.push_back(cloudColumn("rgb", colorsOf(cloud.label, classes)));
+  columns.back().type = FieldType::kFloat32;  // packed, as RViz and PCL read it
+  columns.push_back(cloudColumn("label", cloud.label));
+  columns.push_back(cloudColumn("confidence", cloud.confidence));
+  columns.push_back(cloudColumn("entropy", cloud.entropy));
+  columns.push_back(cloudColumn("cameras", cloud.cameras));
+  columns.push_back(status);
+  columns.push_back(cloudColumn("", cloud.probabilities));
+  columns.back().names.clear();
   for (int id = 0; id < classes.size(); ++id) {
-    const std::uint32_t offset = addField("p_" + classes[id].name, FieldType::kFloat32, &bytes);
-    if (id == 0) first_class = offset;
+    columns.back().names.push_back("p_" + classes[id].name);
   }
-  allocatePoints(cloud.size(), &bytes);
+  return columns;
+}
 
-  const std::array<std::uint32_t, 256> rgb_of_label = colorsOf(classes);
-  const std::size_t class_count = static_cast<std::size_t>(cloud.class_count);
-  std::uint8_t* point = bytes.data.data();
-  for (std::size_t i = 0; i < cloud.size(); ++i, point += bytes.point_step) {
-    putCommon(cloud.points, i, common, point);
-    put(rgb_of_label[cloud.label[i]], rgb, point);
-    put(cloud.label[i], label, point);
-    put(cloud.confidence[i], confidence, point);
-    put(cloud.entropy[i], entropy, point);
-    put(cloud.cameras[i], cameras, point);
-    put(cloud.points.status[i], status, point);
-    if (class_count == 0) continue;
-    std::memcpy(point + first_class, cloud.probabilities.data() + i * class_count,
-                class_count * sizeof(float));
+CloudBytes cloudBytes(std::size_t points, const CloudColumns& columns) {
+  // All fields of some points before the next points: their bytes stay in the nearest cache.
+  constexpr std::size_t kAtOnce = 128;
+  CloudBytes bytes;
+  std::vector<std::uint32_t> offsets;
+  for (const CloudColumn& column : columns) offsets.push_back(addFields(column, &bytes));
+  allocatePoints(points, &bytes);
+  for (std::size_t first = 0; first < points; first += kAtOnce) {
+    const std::size_t count = std::min(kAtOnce, points - first);
+    std::uint8_t* point = bytes.data.data() + first * bytes.point_step;
+    for (std::size_t c = 0; c < columns.size(); ++c) {
+      scatterColumn(columns[c], first, count, bytes.point_step, point + offsets[c]);
+    }
   }
   return bytes;
+}
+
+CloudBytes compensatedCloudBytes(const Cloud& cloud) {
+  return cloudBytes(cloud.size(), compensatedColumns(cloud));
+}
+
+CloudBytes semanticCloudBytes(const SemanticCloud& cloud, const LabelSet& classes) {
+  return cloudBytes(cloud.size(), semanticColumns(cloud, classes));
 }
 
 }  // namespace semantic_lidar_fusion
