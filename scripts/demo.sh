@@ -9,6 +9,9 @@
 #     --rate F           speed of playback; 1 = as on the vehicle (default: 0.5)
 #     --drive DIR        a KITTI raw drive instead (DATE/DATE_drive_NNNN_sync beside its calibration
 #                        files): imports it, runs the network of --model, fuses it offline
+#     --calibration DIR  a folder of ACFR's camera-lidar calibration tool instead (images, pcd,
+#                        camera_info.yaml, calibration runs; or its compact form, whose board needs
+#                        no network): imports its poses, fuses them offline
 #     --model FILE       an ONNX network for which config/models/ has a description of that name
 #     --output DIR       where bags, tables and pictures go (default: demo/ of the build folder)
 #     --build-dir DIR    where to build (default: build/ of the package)
@@ -21,7 +24,7 @@ PATH=/usr/sbin:/usr/bin:/sbin:/bin
 source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 package=semantic_lidar_fusion
 
-usage() { sed -n '3,19s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
+usage() { sed -n '3,22s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
 fail() {
   echo "demo.sh: $*" >&2
   exit "${code:-1}"
@@ -37,19 +40,20 @@ logged() {
   }
 }
 
-duration=2 scale=0.5 rate=0.5 drive="" network=""
+duration=2 scale=0.5 rate=0.5 drive="" calibration="" network=""
 build_dir=$source_dir/build output="" install=1 build=1
 jobs=$(nproc)
 [ "$jobs" -le 8 ] || jobs=8
 while [ $# -gt 0 ]; do
   case $1 in
-    --duration | --scale | --rate | --drive | --model | --output | --build-dir | --jobs)
+    --duration | --scale | --rate | --drive | --calibration | --model | --output | --build-dir | --jobs)
       [ $# -ge 2 ] && [ -n "$2" ] || code=2 fail "$1 needs a value"
       case $1 in
         --duration) duration=$2 ;;
         --scale) scale=$2 ;;
         --rate) rate=$2 ;;
         --drive) drive=$2 ;;
+        --calibration) calibration=$2 ;;
         --model) network=$2 ;;
         --output) output=$2 ;;
         --build-dir) build_dir=$2 ;;
@@ -68,15 +72,17 @@ done
 for name in duration scale rate; do
   [[ ${!name} =~ ^[0-9]*\.?[0-9]+$ ]] || code=2 fail "--$name is '${!name}'; it must be a number"
 done
-[ -n "$drive" ] || [ -z "$network" ] || code=2 fail "--model is for --drive"
+[ -z "$drive" ] || [ -z "$calibration" ] || code=2 fail "--drive and --calibration exclude each other"
+recorded=$drive$calibration
+[ -n "$recorded" ] || [ -z "$network" ] || code=2 fail "--model is for --drive and --calibration"
 [ -z "$drive" ] || [ -n "$network" ] || code=2 fail "--drive needs --model FILE.onnx"
-if [ -n "$drive" ]; then
-  [ -d "$drive" ] || fail "no KITTI raw drive at $drive"
+[ -z "$recorded" ] || [ -d "$recorded" ] || fail "no folder at $recorded"
+[ -z "$recorded" ] || recorded=$(cd "$recorded" && pwd)
+if [ -n "$network" ]; then
   [ -f "$network" ] || fail "no network at $network"
   # The description of the network (input size, means, classes) that names this file.
   description=$(grep -lxF "file: $(basename "$network")" "$source_dir"/config/models/*.yaml | head -1) ||
     fail "no description in config/models/ has the line 'file: $(basename "$network")'"
-  drive=$(cd "$drive" && pwd)
   network=$(cd "$(dirname "$network")" && pwd)/$(basename "$network")
 fi
 
@@ -116,12 +122,24 @@ source "$build_dir/install/setup.bash"
 set -u
 rm -rf "$output"/{tables,figures} "$output"/{drive,live,fused}.bag
 
-if [ -n "$drive" ]; then
-  step "import $drive"
-  sed "s|^file: .*|file: $network|" "$description" >"$output/model.yaml"
+if [ -n "$recorded" ]; then
+  step "import $recorded"
   rig=$output/rig.yaml
-  logged "$output/import.log" rosrun $package import_dataset.py kitti "$drive" "$output/drive.bag" \
-    --rig-out "$rig" --model "$output/model.yaml"
+  scores=()
+  if [ -n "$network" ]; then
+    sed "s|^file: .*|file: $network|" "$description" >"$output/model.yaml"
+    scores=(--model "$output/model.yaml")
+  else
+    scores=(--scores onehot --score-stride 4)  # the board's own labels
+  fi
+  dataset=kitti
+  [ -z "$calibration" ] || dataset=acfr_calibration
+  logged "$output/import.log" rosrun $package import_dataset.py $dataset "$recorded" "$output/drive.bag" \
+    --rig-out "$rig" "${scores[@]}"
+  if [ -n "$calibration" ] && [ -z "$network" ]; then
+    step "offline in three configurations, and the tables"
+    logged "$output/evaluate.log" rosrun $package evaluate.py "$output/drive.bag" --rig "$rig" --out "$output/tables"
+  fi
 else
   rig=$source_dir/config/demo.yaml
   simulator=$build_dir/install/lib/$package/simulate_drive
@@ -145,7 +163,7 @@ logged "$output/figures.log" rosrun $package make_figures.py "$output/fused.bag"
   --rig "$rig" --out "$output/figures"
 
 step "done"
-if [ -z "$drive" ]; then
+if [ -f "$output/tables/report.md" ]; then
   sed '1d' "$output/tables/report.md"
   echo
 fi

@@ -4,6 +4,8 @@
 import itertools
 import os
 import shutil
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ import rosbag  # noqa: E402
 
 from semantic_lidar_fusion.bags import bag_io, cloud_io, poses  # noqa: E402
 from semantic_lidar_fusion.datasets import kitti, records  # noqa: E402
-from semantic_lidar_fusion.datasets import rellis, writer  # noqa: E402
+from semantic_lidar_fusion.datasets import rellis, table, writer  # noqa: E402
 from semantic_lidar_fusion.errors import DataError  # noqa: E402
 from semantic_lidar_fusion.labels import LabelSet, package_file  # noqa: E402
 
@@ -760,7 +762,7 @@ class TestCompactRellis:
         message = got.messages["/pylon/scores"][0]
         assert (message.width, message.height, message.encoding) == (240, 150, "32FC20")
         labels = LabelSet.from_tree(got.rig["classes"], "rig")
-        drive = rellis.read(folder, labels, (), 0, None)
+        drive = rellis.read(folder, labels, "none", 0, None)
         human = drive.label_values(drive.cameras[0].images[0].label_path)
         # Human labels at the points' pixels agree with the points' labels on 77.3 %, as known.
         k = np.array(got.messages["/pylon/camera_info"][0].K).reshape(3, 3)
@@ -770,3 +772,52 @@ class TestCompactRellis:
         inside = front & (pixel >= 0).all(axis=1) & (pixel < [1920, 1200]).all(axis=1)
         agreement = np.mean(human[pixel[inside, 1], pixel[inside, 0]] == truth["label"][inside])
         assert inside.sum() == 7429 and round(100 * agreement, 1) == 77.3
+
+
+def test_a_row_adds_a_data_set(run_command, tmp_path, monkeypatch):
+    """A data set that the package does not have: one point a scan, as far as its option says."""
+    module = types.ModuleType("semantic_lidar_fusion.datasets.dummy")
+
+    def read(folder, labels, first, last, distance):
+        def load():
+            xyz = np.array([[distance, 0, 0]], np.float32)
+            return records.Scan(xyz, np.ones(1, np.float32), None, None, None)
+
+        stamps = [records.EPOCH_NS + n * 10**8 for n in range(first, last + 1)]
+        scans = [records.ScanRecord(stamp, load) for stamp in stamps]
+        image = os.path.join(folder, "image.png")
+        images = [records.ImageRecord(stamp, image) for stamp in stamps]
+        k = np.diag([40.0, 40.0, 1.0])
+        camera = records.CameraRecord(
+            "front", "lens", "lidar", np.eye(4), k, "plumb_bob", (0.0,) * 5, False, images
+        )
+        about = ["Made up."]
+        return records.Drive(
+            "dummy",
+            labels,
+            [camera],
+            "/points",
+            "lidar",
+            np.eye(4),
+            scans,
+            None,
+            False,
+            about,
+            None,
+        )
+
+    made.write_image(str(tmp_path / "image.png"))
+    module.read = read
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    options = (table.option("--distance", type=float, default=1.0, help="m"),)
+    row = table.Dataset("dummy", "dummy:read", "config/classes_usyd12.yaml", "a", "b", options)
+    monkeypatch.setattr(table, "DATASETS", table.DATASETS + [row])
+    out = tmp_path / "out.bag"
+    arguments = ["dummy", tmp_path, out, "--distance", "7", "--first", "2", "--last", "4"]
+    code, said, err = run_command(SCRIPT, *arguments)
+    assert code in (0, None), err
+    assert "3 scans (3 points), 3 images" in said
+    got = Imported(out, tmp_path / "out.yaml")
+    assert got.cloud("/points")["x"].tolist() == [7.0]
+    assert got.stamps("/points")[0] == records.EPOCH_NS + 2 * 10**8
+    assert got.rig["classes"]["classes"][0]["name"] == "unlabeled"

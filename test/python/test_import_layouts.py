@@ -4,6 +4,7 @@ layouts, with all numbers known; the calibration folder also on real data."""
 
 import json
 import os
+import subprocess
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import dataset_factory as made  # noqa: E402
 from command_line import assert_one_line  # noqa: E402
 from test_import_dataset import Imported  # noqa: E402
 
-from semantic_lidar_fusion.bags import poses  # noqa: E402
+from semantic_lidar_fusion.bags import bag_io, cloud_io, poses  # noqa: E402
 from semantic_lidar_fusion.datasets import acfr_calibration, pcd  # noqa: E402
 from semantic_lidar_fusion.errors import DataError  # noqa: E402
 from semantic_lidar_fusion.labels import LabelSet, package_file  # noqa: E402
@@ -377,3 +378,39 @@ def test_real_calibration_poses(run_command, tmp_path, optional_data):
     seen = drive.in_camera("/camera/camera_info", "/velodyne_points", centre_lidar[None])[0]
     # Within three of the calibration's own standard deviations of 4 to 30 mm.
     assert np.linalg.norm(seen - centre_camera) < 0.09
+
+
+def test_real_board_through_fuse_bag(run_command, tmp_path, optional_data):
+    """The paper's camera and lidar: the board's labels, drawn from its corners, on its points."""
+    folder = optional_data("data/acfr_a0_vlp16")
+    drive, out, _ = imported(
+        run_command, tmp_path, "acfr_calibration", folder, "--scores", "onehot", "--score-stride", 4
+    )
+    assert "8 score images" in out and "193601 labelled points" in out
+    board = [c["name"] for c in drive.rig["classes"]["classes"]].index("sign")
+    truth = np.concatenate(
+        [m["label"] for m in map(cloud_io.to_array, drive.messages["/points_truth"])]
+    )
+    f1 = {}
+    for mode in ("off", "adaptive"):
+        fused = tmp_path / (mode + ".bag")
+        program = os.path.join(os.environ["SLF_BIN_DIR"], "fuse_bag")
+        command = [program, tmp_path / "out" / "drive.bag", fused, "--quiet"]
+        command += ["--rig", tmp_path / "out" / "drive.yaml", "--set", "occlusion.mode=" + mode]
+        subprocess.run([str(part) for part in command], check=True, timeout=100)
+        with bag_io.BagReader(str(fused)) as bag:
+            messages = [entry.message for entry in bag.read(["/points_semantic"])]
+        cloud = np.concatenate([cloud_io.to_array(m) for m in messages])
+        assert len(cloud) == len(truth)
+        labelled = cloud["status"] == 0
+        # No pixel beyond the fold-over at 68.44 deg: without the guard a quarter are ghosts.
+        p = drive.in_camera("/camera/camera_info", "/velodyne_points", cloud_io.xyz(cloud))
+        theta = np.degrees(np.arctan2(np.hypot(p[:, 0], p[:, 1]), p[:, 2]))
+        assert theta[labelled].max() < 68.44
+        hits = (labelled & (truth == board) & (cloud["label"] == board)).sum()
+        taken = (labelled & (cloud["label"] == board)).sum()
+        # Board points that the mask removed are misses, too.
+        f1[mode] = 2 * hits / (taken + ((truth == board) & (cloud["status"] <= 1)).sum())
+    # The data's README gives 0.851 and 0.952.
+    assert f1["off"] == pytest.approx(0.851, abs=0.01)
+    assert f1["adaptive"] > 0.945

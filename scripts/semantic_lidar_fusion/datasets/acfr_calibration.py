@@ -6,7 +6,9 @@
   *.csv                  calibration runs: roll,pitch,yaw,x,y,z of the camera in the lidar's frame
                          (rad, fixed axes x y z; m); the mean is the calibration
   camera_info.yaml       distortion_model (fisheye, non-fisheye), width, height, K, D
-Compact form: poseN.jpg and poseN.npz beside extrinsic_runs.csv.
+Compact form: poseN.jpg and poseN.npz beside extrinsic_runs.csv; with `board_corners_camera_m` (4, 3)
+and `on_board` (one for each point) in the .npz files, images and points have the labels board and
+background (sign and building in a class set of streets).
 
 Poses are one second apart; the vehicle stands, so motion is disabled. The runs become a file
 `extrinsic_runs.csv` that a rig names for its errors. `base_link` is the lidar.
@@ -15,7 +17,7 @@ Poses are one second apart; the vehicle stands, so motion is disabled. The runs 
 import glob
 import os
 import re
-from typing import Callable, Dict, List, Optional, Tuple
+from typing import Callable, Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -38,6 +40,9 @@ _LENSES = {
 # Of the compact form, which holds one vehicle's front camera (its README).
 _COMPACT_K = ((1176.93, 0.0, 962.275), (0.0, 1177.72, 612.725), (0.0, 0.0, 1.0))
 _COMPACT_D = (-0.0540096, -0.0784275, 0.0959641, -0.0515253)
+_CLASSES: Dict[int, Sequence[str]] = {0: ("background", "building"), 1: ("board", "sign")}
+_FIELDS = ("x", "y", "z", "intensity", "ring", "on_board", "board_corners_camera_m")
+_STEPS_OF_EDGE = 64  # straight edges bend in a fisheye
 
 
 def read(
@@ -55,6 +60,8 @@ def read(
     runs = read_runs(runs_path)
     k, model, d = _lens(folder, compact, camera_info)
     stamps = {n: records.EPOCH_NS + index * PERIOD_NS for index, n in enumerate(numbers)}
+    table = _board_table(labels) if compact else {}
+    board = _BoardImages({scans[n]: images[n] for n in numbers}, k, model, d, table)
     camera = records.CameraRecord(
         CAMERA,
         CAMERA_FRAME,
@@ -64,7 +71,7 @@ def read(
         model,
         d,
         False,
-        [records.ImageRecord(stamps[n], images[n]) for n in numbers],
+        [records.ImageRecord(stamps[n], images[n], board.path(scans[n])) for n in numbers],
     )
     return records.Drive(
         "acfr_calibration",
@@ -73,7 +80,7 @@ def read(
         LIDAR_TOPIC,
         LIDAR_FRAME,
         np.eye(4),
-        [records.ScanRecord(stamps[n], _loader(scans[n])) for n in numbers],
+        [records.ScanRecord(stamps[n], _loader(scans[n], table)) for n in numbers],
         None,
         False,
         [
@@ -81,8 +88,56 @@ def read(
             "Extrinsics: the mean of %d runs of the target calibration (%s)."
             % (len(runs), os.path.basename(runs_path)),
         ],
-        None,
+        board.labels if compact else None,
     )
+
+
+def _board_table(labels: LabelSet) -> Dict[int, int]:
+    """0 (not the board) and 1 -> id in `labels`; empty where the set has no such classes."""
+    try:
+        return records.class_table(_CLASSES, labels)
+    except DataError:
+        return {}
+
+
+class _BoardImages:
+    """Label images of the board, drawn from its corners as the camera found them."""
+
+    def __init__(
+        self,
+        images: Dict[str, str],
+        k: np.ndarray,
+        model: str,
+        d: Sequence[float],
+        table: Dict[int, int],
+    ):
+        """`images`: .npz file -> its image."""
+        self._images, self._k, self._model, self._table = images, k, model, table
+        self._d = np.asarray(d, dtype=float)
+
+    def path(self, scan: str) -> Optional[str]:
+        """The .npz file if it holds corners."""
+        return scan if self._table and "board_corners_camera_m" in _npz(scan) else None
+
+    def labels(self, path: str) -> np.ndarray:
+        """(H, W) u8 ids."""
+        import cv2
+
+        corners = np.asarray(_npz(path)["board_corners_camera_m"], dtype=float)
+        if corners.shape != (4, 3) or not (corners[:, 2] > 0).all():
+            raise DataError(
+                "%s: board_corners_camera_m are not four points before the camera" % path
+            )
+        part = np.linspace(0.0, 1.0, _STEPS_OF_EDGE, endpoint=False)[:, None]
+        edges = [a + part * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0))]
+        outline = np.concatenate(edges)[:, None]
+        project = cv2.fisheye.projectPoints if self._model == "equidistant" else cv2.projectPoints
+        pixels = project(outline, np.zeros(3), np.zeros(3), self._k, self._d)[0]
+        image = self._images[path]
+        width, height, _ = records.image_size(records.read_bytes(image), image)
+        ids = np.zeros((height, width), dtype=np.uint8)
+        cv2.fillPoly(ids, [np.rint(pixels).astype(np.int32)], 1)
+        return records.map_ids(ids.astype(np.int64), self._table)
 
 
 def read_runs(path: str) -> np.ndarray:
@@ -167,7 +222,7 @@ def _lens(
     return k.reshape(3, 3), model, tuple(d)
 
 
-def _loader(path: str) -> Callable[[], records.Scan]:
+def _loader(path: str, table: Dict[int, int]) -> Callable[[], records.Scan]:
     def load() -> records.Scan:
         if path.endswith(".npz"):
             fields = _npz(path)
@@ -180,7 +235,10 @@ def _loader(path: str) -> Callable[[], records.Scan]:
         keep = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
         intensity = fields.get("intensity", np.zeros(len(xyz), np.float32)).astype(np.float32)
         ring = fields["ring"][keep].astype(np.uint16) if "ring" in fields else None
-        return records.Scan(xyz[keep], intensity[keep], ring, None, None)
+        label = None
+        if table and "on_board" in fields:
+            label = records.map_ids(fields["on_board"][keep].astype(np.int64), table)
+        return records.Scan(xyz[keep], intensity[keep], ring, None, label)
 
     return load
 
@@ -188,7 +246,7 @@ def _loader(path: str) -> Callable[[], records.Scan]:
 def _npz(path: str) -> Dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as file:
-            names: List[str] = [n for n in ("x", "y", "z", "intensity", "ring") if n in file]
+            names: List[str] = [n for n in _FIELDS if n in file]
             return {name: file[name] for name in names}
     except (OSError, ValueError, KeyError) as error:
         raise DataError("%s: not a readable .npz file (%s)" % (path, error)) from error

@@ -35,7 +35,10 @@ LIDAR_FRAME = "os1_cloud_node"
 LIDAR_TOPIC = "/os1_cloud_node/points"
 CAMERA = "pylon"
 CAMERA_FRAME = "pylon_camera_node"
-DISTORTIONS = {"none": (), "published": (-0.134313, -0.025905, 0.002181, 0.00084)}
+DISTORTIONS: Dict[str, Tuple[float, ...]] = {
+    "none": (),
+    "published": (-0.134313, -0.025905, 0.002181, 0.00084),
+}
 _COMPACT_FILE = "frame.npz"
 
 # Ids of the label images and scans -> names in the class sets, best first.
@@ -84,15 +87,16 @@ _PLY_TYPES = {
 def read(
     folder: str,
     labels: LabelSet,
-    distortion: Sequence[float],
+    distortion: str,
     first: int,
     last: Optional[int],
 ) -> records.Drive:
-    """A sequence or the compact frame. `distortion`: k1 k2 p1 p2 [k3] of plumb_bob, or empty."""
+    """A sequence or the compact frame. `distortion`: a key of DISTORTIONS."""
     folder = os.path.abspath(records.require_folder(folder))
+    coefficients = DISTORTIONS[distortion]
     if os.path.isfile(os.path.join(folder, _COMPACT_FILE)):
-        return _read_compact(folder, labels, distortion)
-    return _read_sequence(folder, labels, distortion, first, last)
+        return _read_compact(folder, labels, coefficients)
+    return _read_sequence(folder, labels, coefficients, first, last)
 
 
 def class_ids(labels: LabelSet) -> Dict[int, int]:

@@ -122,6 +122,29 @@ def time_correction(bag: str) -> float:
     return next((value for key, value in TIME_CORRECTIONS_S.items() if name.startswith(key)), 0.0)
 
 
+def copy(
+    source: str,
+    bag_path: str,
+    rig_path: str,
+    labels: LabelSet,
+    raw_images: bool,
+    model: str,
+    cameras: Optional[List[str]],
+    time_correction: Optional[float],
+    start: float,
+    duration: Optional[float],
+    first_frame: int,
+    jpeg_quality: int,
+) -> str:
+    """write() as the table of data sets calls it; what was done, in a line."""
+    cli.require("cv2")
+    quality = 0 if raw_images else jpeg_quality
+    options = Options(cameras, time_correction, start, duration, first_frame, quality, model)
+    summary = write(source, bag_path, rig_path, labels, options)
+    warn_of_missing(summary)
+    return describe(summary)
+
+
 def write(source: str, bag_path: str, rig_path: str, labels: LabelSet, options: Options) -> Summary:
     """Writes the bag with images and its rig file; either whole or not at all."""
     source = find_bag(source)
