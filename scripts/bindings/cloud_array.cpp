@@ -18,7 +18,10 @@ py::array structuredArray(CloudBytes&& bytes) {
       case FieldType::kUint16:
         formats.append("u2");
         break;
-      default:
+      case FieldType::kUint32:
+        formats.append("u4");
+        break;
+      case FieldType::kFloat32:
         formats.append("f4");
     }
     offsets.append(field.offset);
