@@ -4,8 +4,8 @@
 # that a user would take instead. Figures go to benchmark/*.json of the build folder.
 #
 #   scripts/benchmark.sh [options]
-#     --only PART        stages (Google Benchmark), superpixels (beside fast-slic) or rig (the
-#                        whole rig in a nodelet manager); default: all three
+#     --only PART        stages (Google Benchmark), superpixels (beside fast-slic), rig (the whole
+#                        rig in a nodelet manager) or offline (fuse_bag); default: all four
 #     --rig SECONDS      play the rig for so long in each of its three rows (default: 60)
 #     --repetitions N    of each stage (default: 9); medians count
 #     --markdown         print the table as Markdown, for the README
@@ -29,7 +29,7 @@ fail() {
 }
 step() { echo "== $*" >&2; }
 
-only="stages superpixels rig" seconds=60 repetitions=9 style=text
+only="stages superpixels rig offline" seconds=60 repetitions=9 style=text
 build_dir=$source_dir/build install=1
 jobs=$(nproc)
 [ "$jobs" -le 8 ] || jobs=8
@@ -60,8 +60,8 @@ done
 [ "$seconds" -ge 5 ] || code=2 fail "--rig is '$seconds'; it must be at least 5 seconds"
 for part in $only; do
   case $part in
-    stages | superpixels | rig) ;;
-    *) code=2 fail "--only is '$part'; it must be stages, superpixels or rig" ;;
+    stages | superpixels | rig | offline) ;;
+    *) code=2 fail "--only is '$part'; it must be stages, superpixels, rig or offline" ;;
   esac
 done
 wanted() { [[ " $only " == *" $1 "* ]]; }
@@ -167,6 +167,18 @@ if wanted rig; then
       --json "$out/rig.json" >&2 || fail "benchmark_rig.py failed"
   else
     step "no rig: simulate_drive is not built"
+  fi
+fi
+
+if wanted offline; then
+  rm -f "$out/offline.json"
+  if simulated rig.bag --scale 1 --duration 3 && simulated half.bag --width 960 --duration 3; then
+    step "fuse_bag beside a plain chain"
+    /usr/bin/python3 "$source_dir/test/benchmark/benchmark_fuse_bag.py" --fuse-bag "$bin/fuse_bag" \
+      --rig "$source_dir/config/demo.yaml" --json "$out/offline.json" \
+      "1920x1208=$out/rig.bag" "960x604=$out/half.bag" >&2 || fail "benchmark_fuse_bag.py failed"
+  else
+    step "no fuse_bag: simulate_drive is not built"
   fi
 fi
 

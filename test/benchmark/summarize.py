@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: MIT
 """Prints one table of what the benchmarks left in a folder, and writes it there as summary.json.
 
-Reads stage_*.json (Google Benchmark), superpixels.json (compare_fast_slic.py) and rig.json
-(benchmark_rig.py); what is absent is left out. Ratios are those of medians of CPU times that were
+Reads stage_*.json (Google Benchmark), superpixels.json (compare_fast_slic.py), rig.json
+(benchmark_rig.py) and offline.json (benchmark_fuse_bag.py); what is absent is left out. Ratios are those of medians of CPU times that were
 taken in one run; goals are the least ratio (must) and the wanted one (aim).
 """
 
@@ -98,6 +98,9 @@ RIG_NAMES = {
     "late": "whole rig, scores 120 ms late",
     "tcp": "whole rig, JPEG images over TCP",
 }
+# s of bag per s on two threads: must, aim; and of three outputs against one, in time.
+OFFLINE_GOALS = {"1920x1208": (2.0, 3.0), "960x604": (3.0, 5.0)}
+OUTPUTS_GOAL = (1.6, 1.3)
 UNITS = {"ns": 1e-6, "us": 1e-3, "ms": 1.0, "s": 1e3}
 
 
@@ -196,6 +199,27 @@ def quality_rows(folder):
     return rows
 
 
+def offline_rows(folder):
+    """Cells of the table of fuse_bag's throughput."""
+    rows = []
+    for size, figures in (load(os.path.join(folder, "offline.json")) or {}).items():
+        two, plain = figures["two threads"]["speed"], figures["plain chain"]["speed"]
+        times = two / figures["three outputs"]["speed"]
+        rows.append(
+            [
+                "fuse_bag, five JPEG cameras, " + size,
+                "%.2f" % figures["one thread"]["speed"],
+                "%.2f" % two,
+                goal(*OFFLINE_GOALS[size]),
+                verdict(two, *OFFLINE_GOALS[size]),
+                "%.0f core-ms" % figures["two threads"]["cpu_ms_per_scan"],
+                "%.1fx" % (two / plain),
+                "%.2fx, %s" % (times, verdict(times, *OUTPUTS_GOAL, less=True)),
+            ]
+        )
+    return rows
+
+
 def machine(load_before):
     """What was measured on, as far as it tells."""
     with open("/proc/cpuinfo") as file:
@@ -279,6 +303,19 @@ def print_tables(summary, style):
             for row in summary["rig"]
         ]
         print(table(head, rows, style))
+    if summary["offline"]:
+        print()
+        head = [
+            "s of bag per s (rosbag play: 1)",
+            "one thread",
+            "two threads",
+            "must (aim)",
+            "met",
+            "a scan",
+            "plain numpy and OpenCV chain",
+            "three outputs, must 1.6x (1.3x)",
+        ]
+        print(table(head, summary["offline"], style))
     if summary["quality"]:
         held = [row for row in summary["quality"] if row["held"]]
         worst = max(summary["quality"], key=lambda row: row["error_ratio"])
@@ -331,9 +368,10 @@ def main():
         "machine": machine(arguments.load_before),
         "ratios": ratio_rows(arguments.folder),
         "rig": rig_rows,
+        "offline": offline_rows(arguments.folder),
         "quality": quality_rows(arguments.folder),
     }
-    if not summary["ratios"] and not summary["rig"]:
+    if not any(summary[part] for part in ("ratios", "rig", "offline")):
         raise SystemExit("summarize: no figures in " + arguments.folder)
     print_tables(summary, arguments.style)
     with open(os.path.join(arguments.folder, "summary.json"), "w") as file:
