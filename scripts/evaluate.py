@@ -144,6 +144,12 @@ def make_parser():
         "--frame", metavar="NAME", help="frame of the map (default: map or odom, as tf has it)"
     )
     parser.add_argument("--fuse-bag", metavar="FILE", help="the program (default: looked for)")
+    parser.add_argument(
+        "--jobs",
+        metavar="N",
+        type=cli.positive,
+        help="threads of fuse_bag (default: one for each processor); no effect on the results",
+    )
     parser.add_argument("--keep-bags", action="store_true", help="keep the fused bags in --out")
     parser.add_argument("--force", action="store_true", help="replace earlier results in --out")
     return parser

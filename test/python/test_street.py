@@ -65,11 +65,14 @@ def test_each_step_helps_on_a_fast_drive(tmp_path):
     rig = Rig.load(RIG)
     truth = scoring.Truth(str(bag), len(rig.labels))
     scores = []
-    for configuration in scoring.configurations(rig):
-        fused = str(tmp_path / (configuration.name + ".bag"))
-        scoring.run_fuse_bag(PROGRAMS[1], str(bag), fused, RIG, configuration.settings)
-        clouds = scoring.FusedBag(fused, rig.labels.names)
-        scores.append(scoring.score_bag(configuration.name, clouds, truth, rig.labels))
+    targets = {
+        entry.name: scoring.FuseTarget(str(tmp_path / (entry.name + ".bag")), entry.settings)
+        for entry in scoring.configurations(rig)
+    }
+    scoring.run_fuse_bag(PROGRAMS[1], str(bag), RIG, list(targets.values()))
+    for name, target in targets.items():
+        clouds = scoring.FusedBag(target.path, rig.labels.names)
+        scores.append(scoring.score_bag(name, clouds, truth, rig.labels))
     accuracy = [score.confusion.accuracy for score in scores]
     assert accuracy[0] < accuracy[1] < accuracy[-1]
     first, last = scores[0].confusion, scores[-1].confusion

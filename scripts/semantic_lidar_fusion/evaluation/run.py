@@ -17,6 +17,7 @@ from semantic_lidar_fusion.evaluation.scoring import (
     CalibrationCase,
     Configuration,
     FusedBag,
+    FuseTarget,
     Score,
     Truth,
 )
@@ -152,6 +153,7 @@ class Options:
     label_suffix: str = "_annot"
     pixel_step: int = 2
     fuse_bag: Optional[str] = None
+    jobs: Optional[int] = None
     keep_bags: bool = False
     force: bool = False
 
@@ -171,6 +173,7 @@ class Fuser:
         self.rig, self._workspace = rig, workspace
         self._program = find_fuse_bag(options.fuse_bag)
         self._settings = list(options.settings) + scoring.required_settings(rig)
+        self._jobs, self._compress = options.jobs, options.keep_bags
 
     @property
     def settings(self) -> List[str]:
@@ -181,14 +184,22 @@ class Fuser:
     def program(self) -> str:
         return self._program
 
-    def fuse(self, bag: str, configuration: Configuration, prefix: str = "") -> str:
-        """The path of the fused bag."""
-        target = os.path.join(self._workspace, "%s%s.bag" % (prefix, configuration.name))
-        settings = self._settings + list(configuration.settings)
+    def fuse(
+        self, bag: str, configurations: Sequence[Configuration], prefix: str = ""
+    ) -> Dict[str, str]:
+        """The paths of the fused bags by the names of their configurations: one run makes all."""
+        targets = {
+            entry.name: FuseTarget(
+                os.path.join(self._workspace, "%s%s.bag" % (prefix, entry.name)),
+                tuple(self._settings) + tuple(entry.settings),
+                entry.truth,
+            )
+            for entry in configurations
+        }
         scoring.run_fuse_bag(
-            self._program, bag, target, self.rig.path, settings, truth=configuration.truth
+            self._program, bag, self.rig.path, list(targets.values()), self._jobs, self._compress
         )
-        return target
+        return {name: target.path for name, target in targets.items()}
 
 
 def evaluate(options: Options) -> str:
@@ -280,14 +291,14 @@ def _columns(
     else:
         wanted = scoring.configurations(fuser.rig, options.paper)
         wanted += scoring.bounds(fuser.rig) if options.bounds else []
-        made = {entry.name: fuser.fuse(bag, entry, prefix) for entry in wanted}
+        extra = []
+        package = [entry for entry in wanted if entry.name == PACKAGE]
+        if package and fuser.rig.text("occlusion.mode") != "off" and truth.has_visibility:
+            extra = [Configuration(PACKAGE + "_unmasked", ("occlusion.mode=off",))]
+        made = fuser.fuse(bag, wanted + extra, prefix)
         for entry in wanted:
-            without = made.get(entry.without_mask or "")
-            if entry.name == PACKAGE and fuser.rig.text("occlusion.mode") != "off":
-                if truth.has_visibility:
-                    open_view = Configuration(PACKAGE + "_unmasked", ("occlusion.mode=off",))
-                    without = fuser.fuse(bag, open_view, prefix)
-            columns.append(Column(entry.name, made[entry.name], without))
+            mask = extra[0].name if extra and entry.name == PACKAGE else entry.without_mask
+            columns.append(Column(entry.name, made[entry.name], made.get(mask or "")))
     if options.live:
         columns.append(Column("live", options.live))
     return columns
@@ -341,10 +352,14 @@ def _evaluate_masks(options: Options, results: Results, workspace: str) -> str:
     for bag in options.bags:
         truth = _truth(rig, bag, rig.labels)
         open_view = Configuration("unmasked", ("occlusion.mode=off",))
-        unmasked = FusedBag(fuser.fuse(bag, open_view), rig.labels.names)
-        for mask in scoring.MASKS:
-            target = Configuration("masked", mask.settings)
-            masked = FusedBag(fuser.fuse(bag, target), rig.labels.names)
+        masks = [
+            Configuration("masked_%d" % number, mask.settings)
+            for number, mask in enumerate(scoring.MASKS)
+        ]
+        made = fuser.fuse(bag, [open_view] + masks)
+        unmasked = FusedBag(made[open_view.name], rig.labels.names)
+        for mask, entry in zip(scoring.MASKS, masks):
+            masked = FusedBag(made[entry.name], rig.labels.names)
             rates = scoring.mask_visibility(unmasked, masked, truth)
             if rates is None:
                 raise DataError("%s: its points_truth has no field visible" % bag)
@@ -415,7 +430,7 @@ def _evaluate_images(options: Options, results: Results, workspace: str) -> str:
     image_truth.write_bag(images, labels, model, options.pixel_step, bag, path)
     fuser = Fuser(options, Rig.load(path, options.settings, options.fuse_bag), workspace)
     truth = _truth(fuser.rig, bag, labels)
-    target = fuser.fuse(bag, Configuration("pixels", ()))
+    target = fuser.fuse(bag, [Configuration("pixels", ())])["pixels"]
     score = scoring.score_bag("pixels", FusedBag(target, labels.names), truth, labels)
     results.add_scores([score], {})
     if options.fit_temperature:

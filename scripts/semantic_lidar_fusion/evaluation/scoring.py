@@ -142,21 +142,35 @@ MASKS = (
 )
 
 
+class FuseTarget(NamedTuple):
+    """A bag that fuse_bag is to write: overrides of the rig file, and what it takes from the input's
+    truth instead of deciding itself ("visibility")."""
+
+    path: str
+    settings: Tuple[str, ...]
+    truth: Tuple[str, ...] = ()
+
+
 def run_fuse_bag(
     program: str,
     bag: str,
-    target: str,
     rig: str,
-    settings: Sequence[str],
-    truth: Sequence[str] = (),
+    targets: Sequence[FuseTarget],
+    jobs: Optional[int] = None,
+    compress: bool = False,
 ) -> None:
-    """Fuses a bag; DataError with the program's own words if it fails. `truth`: what it takes from
-    the bag's truth instead of deciding itself ("visibility")."""
-    command = [program, bag, target, "--rig", rig, "--force"]
+    """Fuses a bag into all targets, which share the work on its images; DataError with the program's
+    own words if it fails. jobs: its threads (None: its own choice). compress: for bags that stay;
+    others are read sooner as they are."""
+    command = [program, bag, targets[0].path, "--rig", rig, "--force"]
     command += [] if sys.stderr.isatty() else ["--quiet"]
-    command += ["--truth", ",".join(truth)] if truth else []
-    for setting in settings:
-        command += ["--set", setting]
+    command += [] if compress else ["--uncompressed"]
+    command += ["--jobs", str(jobs)] if jobs else []
+    for number, target in enumerate(targets):
+        command += ["--also", target.path] if number else []
+        command += ["--truth", ",".join(target.truth)] if target.truth else []
+        for setting in target.settings:
+            command += ["--set", setting]
     result = subprocess.run(command, stderr=subprocess.PIPE, universal_newlines=True)
     for line in result.stderr.splitlines():
         if result.returncode == 0 and "warn" in line.lower():
@@ -558,34 +572,38 @@ def compare_temperatures(
     labels = report.rig.labels
     exponent = report.rig.number("uncertainty.exponent") or PAPER_EXPONENT
 
-    def fused(case: CalibrationCase, variant: Variant) -> FusedBag:
-        target = os.path.join(folder, "temperature.bag")
-        wanted = [
-            "uncertainty.temperature=%.6g" % variant.temperature,
-            "uncertainty.exponent=%.6g" % variant.exponent,
+    def fused(case: CalibrationCase, variants: Sequence[Variant]) -> List[FusedBag]:
+        targets = [
+            FuseTarget(
+                os.path.join(folder, "temperature_%d.bag" % number),
+                tuple(settings)
+                + (
+                    "uncertainty.temperature=%.6g" % variant.temperature,
+                    "uncertainty.exponent=%.6g" % variant.exponent,
+                ),
+            )
+            for number, variant in enumerate(variants)
         ]
-        run_fuse_bag(program, case.bag, target, case.rig.path, list(settings) + wanted)
-        return FusedBag(target, labels.names)
+        run_fuse_bag(program, case.bag, case.rig.path, targets)
+        return [FusedBag(target.path, labels.names) for target in targets]
 
-    same = fit.bag == report.bag
-    result: List[Tuple[Variant, Score]] = []
-    fitted: List[Tuple[Variant, Score]] = []
-    for base, constant in (
-        (Variant("raw", 1.0, 0.0), "constant"),
-        (Variant("share", 1.0, exponent), "combined"),
-    ):
-        bag = fused(report, base)
-        result.append((base, score_bag(base.name, bag, report.truth, labels, 0.0, report.parity)))
-        source = bag if same else fused(fit, base)
+    def scored(variant: Variant, bag: FusedBag) -> Tuple[Variant, Score]:
+        return variant, score_bag(variant.name, bag, report.truth, labels, 0.0, report.parity)
+
+    bases = [Variant("raw", 1.0, 0.0), Variant("share", 1.0, exponent)]
+    bags = fused(report, bases)
+    result = [scored(base, bag) for base, bag in zip(bases, bags)]
+    sources = bags if fit.bag == report.bag else fused(fit, bases)
+    constants = []
+    for base, source, name in zip(bases, sources, ("constant", "combined")):
         probabilities, truth = samples_of(source, fit.truth, labels, fit.parity)
         temperature = fit_temperature(probabilities, truth, labels.merge_matrix())
-        variant = Variant(constant, float("%.4g" % temperature), base.exponent)
-        bag = fused(report, variant)
-        fitted.append(
-            (variant, score_bag(variant.name, bag, report.truth, labels, 0.0, report.parity))
-        )
-    os.remove(os.path.join(folder, "temperature.bag"))
-    return result + fitted
+        constants.append(Variant(name, float("%.4g" % temperature), base.exponent))
+    bags = fused(report, constants)
+    result += [scored(constant, bag) for constant, bag in zip(constants, bags)]
+    for bag in bags:
+        os.remove(bag.path)
+    return result
 
 
 def required_settings(rig: Rig) -> List[str]:

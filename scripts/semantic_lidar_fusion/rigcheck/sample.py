@@ -20,7 +20,7 @@ from semantic_lidar_fusion.bags.cloud_io import SemanticCloud, to_array
 from semantic_lidar_fusion.bags.poses import PoseSeries, TransformTree, from_message, invert
 from semantic_lidar_fusion.cameras import Camera
 from semantic_lidar_fusion.errors import DataError, SemanticLidarFusionError
-from semantic_lidar_fusion.evaluation.scoring import run_fuse_bag
+from semantic_lidar_fusion.evaluation.scoring import FuseTarget, run_fuse_bag
 
 PAIRS = 12  # of consecutive scans
 BEFORE_NS, AFTER_NS = 500_000_000, 500_000_000  # copied around each pair, by record time
@@ -407,7 +407,7 @@ def _raw_scans(program: str, cut: str, folder: str, rig: Dict[str, Any]) -> List
     with open(path, "w", encoding="utf-8") as file:
         yaml.safe_dump(plain, file)
     target = os.path.join(folder, "raw.bag")
-    run_fuse_bag(program, cut, target, path, [])
+    run_fuse_bag(program, cut, path, [FuseTarget(target, ())])
     scans = []
     with BagReader(target) as reader:
         for item in reader.read(["/points_compensated"]):
@@ -506,7 +506,8 @@ def _read_fused(
 ) -> None:
     target = os.path.join(folder, "fused.bag")
     try:
-        run_fuse_bag(program, cut, target, rig_path, [*overrides, "keep_unlabelled=true"])
+        settings = (*overrides, "keep_unlabelled=true")
+        run_fuse_bag(program, cut, rig_path, [FuseTarget(target, settings)])
     except DataError as error:
         sample.failure = str(error)
         return
