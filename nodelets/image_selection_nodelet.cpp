@@ -21,8 +21,8 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-/// Images kept per camera until no scan can choose them any more: 2 s at 30 Hz, or 1.2 s of raw
-/// 1920x1208.
+/// Images kept per camera until no scan can choose them any more, at most: 2 s at 30 Hz, or 1.2 s
+/// of raw 1920x1208.
 constexpr std::size_t kMaxImages = 64;
 constexpr std::size_t kMaxImageBytes = 256u << 20;
 constexpr std::size_t kKnownStamps = 64;
@@ -135,7 +135,7 @@ class ImageSelectionNodelet : public FusionNodelet {
     admit(epochs_.get(), imageTopic(camera.config), trueImageTime(camera, stamp),
           [this, index, image, stamp, &camera] {
             camera.images.put(stamp, image);
-            trim(&camera);
+            camera.images.trim(kMaxImageBytes, [](const Image& held) { return held.bytes(); });
             offer(index, stamp);
           });
   }
@@ -159,18 +159,6 @@ class ImageSelectionNodelet : public FusionNodelet {
     if (!isCandidate(camera.config.input, parts, !semanticsComeAlone())) return;
     selector_->addImage(index, stamp);
     decide();
-  }
-
-  /// Old images make room, by number (StampedStore) and by bytes.
-  static void trim(Camera* camera) {
-    std::size_t bytes = 0;
-    for (const auto& [stamp, image] : camera->images.values()) bytes += image.bytes();
-    while (bytes > kMaxImageBytes && camera->images.size() > 1) {
-      const auto oldest = camera->images.values().begin();
-      const StampNs stamp = oldest->first;
-      bytes -= oldest->second.bytes();
-      camera->images.erase(stamp);
-    }
   }
 
   template <class M>
@@ -275,7 +263,10 @@ class ImageSelectionNodelet : public FusionNodelet {
     }
     publish(camera.selection, boost::make_shared<sensor_msgs::TimeReference>(
                                   selectionMessage(decision.scan_ns, decision.image_stamp, name)));
-    if (!decision.image_stamp || camera.sent.find(*decision.image_stamp) != nullptr ||
+    if (!decision.image_stamp) return;
+    // Scans come in order: the next one chooses this image again, or one after it.
+    camera.images.eraseBefore(*decision.image_stamp);
+    if (camera.sent.find(*decision.image_stamp) != nullptr ||
         camera.image_selected.getNumSubscribers() == 0) {
       return;
     }

@@ -26,9 +26,12 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-/// Images whose semantics are kept per camera. One image can serve two scans; a free-running
-/// network sends scores of images long before a scan chooses one: 0.8 s at 30 Hz.
+/// Images whose semantics are kept per camera until no scan can choose them any more, at most. One
+/// image can serve two scans; a free-running network sends scores of images long before a scan
+/// chooses one: 0.8 s at 30 Hz.
 constexpr std::size_t kKeptImages = 24;
+/// The same by size: nine times 960x604x12 floats.
+constexpr std::size_t kMaxSemanticsBytes = 256u << 20;
 
 }  // namespace
 
@@ -41,6 +44,12 @@ class ProjectionNodelet : public FusionNodelet {
   struct Semantics {
     sensor_msgs::ImageConstPtr scores, share, probabilities;
     bool announced = false;  ///< told to the queue
+
+    std::size_t bytes() const {
+      std::size_t sum = 0;
+      for (const auto& part : {scores, share, probabilities}) sum += part ? part->data.size() : 0;
+      return sum;
+    }
   };
   struct Camera {
     Camera(const CameraConfig& config, int index)
@@ -203,6 +212,10 @@ class ProjectionNodelet : public FusionNodelet {
             } else {
               if (camera->semantics.find(stamp) == nullptr) camera->semantics.put(stamp, {});
               if (Semantics* known = camera->semantics.find(stamp)) known->*part = message;
+              health().count(
+                  "dropped: " + camera->config.name + " semantics, more wait than memory is for",
+                  camera->semantics.trim(kMaxSemanticsBytes,
+                                         [](const Semantics& held) { return held.bytes(); }));
             }
             fuseComplete();
           });
@@ -276,6 +289,16 @@ class ProjectionNodelet : public FusionNodelet {
     countPoints(result.cloud);
     publish(output_, semanticCloudMessage(result.cloud, rig().classes));
     if (drawn) publishOverlays(scan, result);
+    dropPassed(scan);
+  }
+
+  /// Scans come in order: the next one chooses the images of this one again, or later ones.
+  void dropPassed(const CompletedScan& scan) {
+    for (const auto& camera : cameras_) {
+      const StampNs chosen = scan.views[static_cast<std::size_t>(camera->index)].image_stamp;
+      camera->semantics.eraseBefore(chosen);  // 0: none was
+      camera->images.eraseBefore(chosen);
+    }
   }
 
   /// Model and extrinsics; no model if either is unknown.

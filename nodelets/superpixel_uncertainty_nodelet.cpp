@@ -5,6 +5,7 @@
 /// Images are clustered as soon as they come, in parallel with the network; the share follows when
 /// the scores of the same stamp are there. Cameras run in parallel on the manager's threads; what
 /// belongs to one camera is guarded by the camera's mutex.
+#include <algorithm>
 #include <memory>
 #include <mutex>
 #include <pluginlib/class_list_macros.hpp>
@@ -29,6 +30,8 @@ constexpr std::size_t kWaiting = 4;
 /// Scores that wait for a scan to choose their image, which many never see: a free-running network
 /// sends those of every image, and a scan comes as much as its own length later. 0.8 s at 30 Hz.
 constexpr std::size_t kWaitingScores = 24;
+/// The same by size: nine times 960x604x12 floats.
+constexpr std::size_t kMaxScoresBytes = 256u << 20;
 
 }  // namespace
 
@@ -137,6 +140,9 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     take(camera, "scores", scores, [this, camera, scores](StampNs stamp) {
       health().count(camera->config.name + " scores of images that no scan chose",
                      camera->scores.put(stamp, scores));
+      const auto bytes = [](const sensor_msgs::ImageConstPtr& held) { return held->data.size(); };
+      health().count("dropped: " + camera->config.name + " scores, more wait than memory is for",
+                     camera->scores.trim(kMaxScoresBytes, bytes));
     });
   }
 
@@ -208,7 +214,17 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     }
     camera->images.erase(stamp);
     camera->scores.erase(stamp);
+    dropUnchosen(camera, stamp);
     return outputs;
+  }
+
+  /// Images are chosen in the order of their stamps: scores before the image of `stamp` that no
+  /// image waits for are of images that no scan has chosen.
+  void dropUnchosen(Camera* camera, StampNs stamp) {
+    const auto& waiting = camera->images.values();
+    if (!waiting.empty()) stamp = std::min(stamp, waiting.begin()->first);
+    health().count(camera->config.name + " scores of images that no scan chose",
+                   camera->scores.eraseBefore(stamp));
   }
 
   /// An error names the topic of the scores or labels, whichever message's arrival it is that shows

@@ -45,6 +45,19 @@ class StampedStore {
     values_.erase(values_.begin(), values_.lower_bound(stamp));
     return before - values_.size();
   }
+  /// Erases the oldest values, but never the newest, until the rest has at most `most` bytes;
+  /// `bytes(value)` tells those of one. Returns their number.
+  template <typename Bytes>
+  std::size_t trim(std::size_t most, const Bytes& bytes) {
+    std::size_t total = 0;
+    for (const auto& value : values_) total += bytes(value.second);
+    std::size_t dropped = 0;
+    for (; total > most && values_.size() > 1; ++dropped) {
+      total -= bytes(values_.begin()->second);
+      values_.erase(values_.begin());
+    }
+    return dropped;
+  }
   void clear() { values_.clear(); }
   std::size_t size() const { return values_.size(); }
   const std::map<StampNs, T>& values() const { return values_; }
