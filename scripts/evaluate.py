@@ -20,6 +20,7 @@ docs/results.md explains every table.
 
   evaluate.py drive.bag --rig rig.yaml --out results
   evaluate.py seed1.bag seed2.bag seed3.bag --rig rig.yaml --out results
+  evaluate.py drives/ --rig rig.yaml --workers 4 --out results
   evaluate.py drive.bag --rig rig.yaml --masks --out results
   evaluate.py drive.bag --rig rig.yaml --clouds online=recorded.bag --out results
   evaluate.py drive.bag --rig rig.yaml --fit-temperature --fit-on other.bag --out results
@@ -35,7 +36,8 @@ def make_parser():
         "bags",
         metavar="IN.bag",
         nargs="*",
-        help="a drive with points_truth; several are scored together and one by one",
+        help="a drive with points_truth, or a folder of such bags; several are scored together and "
+        "one by one",
     )
     parser.add_argument("--rig", metavar="FILE", help="the rig file of the drive")
     parser.add_argument(
@@ -150,6 +152,19 @@ def make_parser():
         type=cli.positive,
         help="threads of fuse_bag (default: one for each processor); no effect on the results",
     )
+    parser.add_argument(
+        "--workers",
+        metavar="N",
+        type=cli.positive,
+        default=1,
+        help="processes that share several drives (default: 1); no effect on the results",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="share them on an existing Dask cluster instead, whose workers reach the files and --out "
+        "under the same names, such as tcp://10.0.0.5:8786",
+    )
     parser.add_argument("--keep-bags", action="store_true", help="keep the fused bags in --out")
     parser.add_argument("--force", action="store_true", help="replace earlier results in --out")
     return parser
@@ -160,6 +175,20 @@ def _not_negative(text):
     if not value >= 0:
         raise argparse.ArgumentTypeError("must not be negative")
     return value
+
+
+def bags_of(parser, given):
+    """The bags that are named, and those of the folders that are named, by name."""
+    bags = []
+    for path in given:
+        if not os.path.isdir(path):
+            bags.append(path)
+            continue
+        found = [name for name in sorted(os.listdir(path)) if name.endswith(".bag")]
+        if not found:
+            parser.error("%s: a folder without a bag" % path)
+        bags += [os.path.join(path, name) for name in found]
+    return bags
 
 
 def check(parser, options):
@@ -201,6 +230,10 @@ def check(parser, options):
         parser.error("--fit-temperature runs fuse_bag; it has no use for --clouds")
     if options.fit_on and not options.fit_temperature:
         parser.error("--fit-on needs --fit-temperature")
+    if options.workers > 1 and options.scheduler:
+        parser.error("give --workers or --scheduler, one of them")
+    if options.masks and (options.workers > 1 or options.scheduler):
+        parser.error("--masks excludes --workers and --scheduler")
     names = [text.partition("=")[0] for text in options.clouds]
     for text, name in zip(options.clouds, names):
         if not name or not text.partition("=")[2] or not name.replace("_", "").isalnum():
@@ -212,6 +245,7 @@ def check(parser, options):
 def main():
     parser = make_parser()
     options = parser.parse_args()
+    options.bags = bags_of(parser, options.bags)
     check(parser, options)
     cli.require("numpy", "scipy", "yaml", "rosbag", "matplotlib")
     from semantic_lidar_fusion.evaluation import run

@@ -281,6 +281,39 @@ def test_motion_correction_shows_in_the_table(run_command, tmp_path):
 
 
 @needs_program
+@pytest.mark.parametrize("how", ["--workers", "--scheduler"])
+def test_drives_of_a_folder_may_be_shared(run_command, tmp_path, how):
+    drives, rig = tmp_path / "drives", tmp_path / "rig.yaml"
+    drives.mkdir()
+    for number in range(2):
+        drive = Drive(scans=1, speed=8.0 + number)
+        bag_factory.write_bag(str(drives / ("%d.bag" % number)), drive)
+        add_truth(drives / ("%d.bag" % number), drive)
+    rig.write_text(bag_factory.rig_text(drive))
+    command = ("evaluate.py", drives, "--rig", rig, "--paper")
+    alone = run_command(*command, "--out", tmp_path / "alone")
+    assert alone[0] == 0, alone[2]
+    if how == "--workers":
+        shared = run_command(*command, "--out", tmp_path / "shared", how, "2")
+    else:
+        distributed = pytest.importorskip("distributed")
+        with distributed.LocalCluster(
+            n_workers=1, processes=False, dashboard_address=None
+        ) as cluster:
+            address = cluster.scheduler_address
+            shared = run_command(*command, "--out", tmp_path / "shared", how, address)
+    assert shared[0] == 0, shared[2]
+    names = sorted(os.listdir(str(tmp_path / "alone")))
+    assert names == sorted(os.listdir(str(tmp_path / "shared")))
+    for name in names:
+        if not name.endswith(".png"):
+            ours, theirs = (tmp_path / folder / name for folder in ("alone", "shared"))
+            assert ours.read_bytes() == theirs.read_bytes(), name
+    text = (tmp_path / "alone" / "report.md").read_text()
+    assert "Each drive" in text
+
+
+@needs_program
 def test_live_clouds_stand_beside_those_of_fuse_bag(run_command, tmp_path):
     drive = Drive(scans=3, speed=5.0)
     bag, path = tmp_path / "in.bag", tmp_path / "rig.yaml"

@@ -214,6 +214,12 @@ class Visibility:
         self.beside = self.beside_lost = 0
         self.has_silhouette = False
 
+    def merge(self, other: "Visibility") -> None:
+        """Adds what another drive has shown."""
+        for name, value in vars(other).items():
+            mine = getattr(self, name)
+            setattr(self, name, mine or value if isinstance(value, bool) else mine + value)
+
     def add(
         self,
         unmasked: np.ndarray,

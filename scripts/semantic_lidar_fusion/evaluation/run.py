@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """From what evaluate.py is asked to its files."""
 
+import dataclasses
 import os
 import shutil
 import tempfile
@@ -24,6 +25,7 @@ from semantic_lidar_fusion.evaluation.scoring import (
 from semantic_lidar_fusion.figures import plotting
 from semantic_lidar_fusion.labels import LabelSet
 from semantic_lidar_fusion.rig import Rig, find_fuse_bag
+from semantic_lidar_fusion.work import Work, in_order
 
 REPORT = "report.md"
 PAGE = "report.html"
@@ -154,6 +156,8 @@ class Options:
     pixel_step: int = 2
     fuse_bag: Optional[str] = None
     jobs: Optional[int] = None
+    workers: int = 1
+    scheduler: Optional[str] = None
     keep_bags: bool = False
     force: bool = False
 
@@ -173,7 +177,10 @@ class Fuser:
         self.rig, self._workspace = rig, workspace
         self._program = find_fuse_bag(options.fuse_bag)
         self._settings = list(options.settings) + scoring.required_settings(rig)
-        self._jobs, self._compress = options.jobs, options.keep_bags
+        self._compress = options.keep_bags
+        # Workers on this machine share its processors.
+        shared = max(1, (os.cpu_count() or 1) // options.workers) if options.workers > 1 else None
+        self._jobs = options.jobs or shared
 
     @property
     def settings(self) -> List[str]:
@@ -247,33 +254,82 @@ def _name(bag: str) -> str:
     return os.path.splitext(os.path.basename(bag))[0]
 
 
-def _evaluate_drives(options: Options, results: Results, workspace: str) -> str:
+class DriveJob(NamedTuple):
+    """One of the drives of an evaluation; workspace: the folder for its fused bags."""
+
+    options: Options
+    number: int
+    workspace: str
+
+
+class EvaluatedDrive(NamedTuple):
+    """rates: what the masks of the configurations catch and lose, by name."""
+
+    columns: List[Column]
+    scores: List[Score]
+    rates: Dict[str, Visibility]
+
+
+def evaluate_drive(job: DriveJob) -> EvaluatedDrive:
+    """Fuses and scores a drive; runs in any process that reaches the files."""
+    options = job.options
+    bag = options.bags[job.number]
     rig = _rig(options)
     labels = rig.labels if rig else scoring.class_set_of(options.clouds[0][1])
-    fuser = Fuser(options, rig, workspace) if rig and not options.clouds else None
+    fuser = Fuser(options, rig, job.workspace) if rig and not options.clouds else None
+    truth = _truth(rig, options.truth or bag, labels)
+    prefix = "%d_" % (job.number + 1) if len(options.bags) > 1 else ""
+    rates: Dict[str, Visibility] = {}
+    columns = _columns(options, fuser, bag, truth, prefix)
+    scores = [_score(options, column, truth, labels, rates) for column in columns]
+    return EvaluatedDrive(columns, scores, rates)
+
+
+def _jobs(options: Options, workspace: str) -> List[DriveJob]:
+    """Workers may run in other folders, and find other programs."""
+    paths = {
+        name: os.path.abspath(getattr(options, name))
+        for name in ("out", "rig", "live", "truth", "fit_on")
+        if getattr(options, name)
+    }
+    if options.rig and not options.clouds:
+        paths["fuse_bag"] = find_fuse_bag(options.fuse_bag)
+    bags = tuple(os.path.abspath(bag) for bag in options.bags)
+    clouds = tuple((name, os.path.abspath(path)) for name, path in options.clouds)
+    placed = dataclasses.replace(options, bags=bags, clouds=clouds, **paths)
+    return [DriveJob(placed, number, os.path.abspath(workspace)) for number in range(len(bags))]
+
+
+def _evaluate_drives(options: Options, results: Results, workspace: str) -> str:
+    jobs = _jobs(options, workspace)
     drives: List[Tuple[str, List[Score]]] = []
     rates: Dict[str, Visibility] = {}
-    for number, bag in enumerate(options.bags):
-        truth = _truth(rig, options.truth or bag, labels)
-        prefix = "%d_" % (number + 1) if len(options.bags) > 1 else ""
-        columns = _columns(options, fuser, bag, truth, prefix)
-        scores = [_score(options, column, truth, labels, rates) for column in columns]
-        drives.append((_name(bag), scores))
+    work = Work(options.workers, options.scheduler)
+    for bag, drive in zip(options.bags, in_order(jobs, evaluate_drive, work)):
+        drives.append((_name(bag), drive.scores))
+        for name, found in drive.rates.items():
+            rates.setdefault(name, Visibility()).merge(found)
     total = _sum(drives)
     results.add_scores(total, rates)
-    results.shown = (columns[-1].path, rig.text("fixed_frame") if rig else "odom", labels)
+    rig = _rig(options)
+    labels = rig.labels if rig else scoring.class_set_of(options.clouds[0][1])
+    fixed_frame = rig.text("fixed_frame") if rig else "odom"
+    results.shown = (drive.columns[-1].path, fixed_frame, labels)
     if options.compare:
         results.add_comparison(*_chosen(total, options.compare))
     if len(drives) > 1:
         results.add_drives(drives)
     if options.live:
-        ours, live = (FusedBag(column.path, labels.names) for column in columns[-2:])
-        results.add_live(scoring.compare_clouds(ours, live), columns[-2].name)
+        ours, live = (FusedBag(column.path, labels.names) for column in drive.columns[-2:])
+        results.add_live(scoring.compare_clouds(ours, live), drive.columns[-2].name)
     if options.map:
-        _add_maps(results, options, columns, truth, labels)
-    if options.fit_temperature and fuser is not None:
+        truth = _truth(rig, options.truth or bag, labels)
+        _add_maps(results, options, drive.columns, truth, labels)
+    if options.fit_temperature and rig and not options.clouds:
+        truth = _truth(rig, options.truth or bag, labels)
         fit_bag = options.fit_on or bag
         fit_truth = _truth(rig, fit_bag, labels) if options.fit_on else truth
+        fuser = Fuser(options, rig, workspace)
         _compare(results, fuser, (fit_bag, fit_truth), (bag, truth), workspace)
     return _title(options)
 
