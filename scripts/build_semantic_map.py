@@ -221,9 +221,9 @@ def check(parser, options):
 
 def request_of(options):
     """The options as what `run.build` takes."""
-    from semantic_lidar_fusion.maps.build import Work
     from semantic_lidar_fusion.maps.run import Request
     from semantic_lidar_fusion.maps.semantic_map import MapConfig
+    from semantic_lidar_fusion.work import Work
 
     defaults = MapConfig()
 

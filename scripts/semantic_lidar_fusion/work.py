@@ -10,6 +10,7 @@ from typing import Any, Callable, Deque, Iterator, NamedTuple, Optional, Sequenc
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.errors import DataError
 
+# What does not answer for so long is lost (s).
 DASK_PATIENCE_S = 5.0
 
 Item = TypeVar("Item")

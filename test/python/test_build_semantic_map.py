@@ -20,6 +20,7 @@ pytest.importorskip("rosbag")
 import bag_factory  # noqa: E402
 from command_line import assert_one_line  # noqa: E402
 
+from semantic_lidar_fusion import work  # noqa: E402
 from semantic_lidar_fusion.bags.bag_io import BagReader  # noqa: E402
 from semantic_lidar_fusion.bags.cloud_io import SemanticCloud  # noqa: E402
 from semantic_lidar_fusion.errors import DataError  # noqa: E402
@@ -155,9 +156,10 @@ def test_a_dask_cluster_gives_the_same_bytes(room, built, tmp_path):
 
 def test_a_scheduler_that_is_not_there_is_said(monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(build, "DASK_PATIENCE_S", 1.0)
+    monkeypatch.setattr(work, "DASK_PATIENCE_S", 1.0)
+    nowhere = work.Work(scheduler="tcp://127.0.0.1:1")
     with pytest.raises(DataError, match="no Dask scheduler at tcp://127.0.0.1:1"):
-        next(build._dask_results([], build.compute_part, "tcp://127.0.0.1:1"))
+        next(work.in_order([], build.compute_part, nowhere))
 
 
 def add_part(accumulator, result):

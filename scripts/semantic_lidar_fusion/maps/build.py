@@ -6,19 +6,12 @@ computed; they are added up here in the order of time, and spilled to disk when 
 that they may take. One process, many workers and a cluster give the same bytes.
 """
 
-import collections
 import dataclasses
 import functools
 import os
-import time
-from concurrent import futures
 from typing import (
-    Any,
-    Callable,
-    Deque,
     Dict,
     Iterable,
-    Iterator,
     List,
     NamedTuple,
     Optional,
@@ -43,10 +36,9 @@ from semantic_lidar_fusion.maps.map_file import (
 )
 from semantic_lidar_fusion.maps.records import pose_of_path
 from semantic_lidar_fusion.maps.semantic_map import COUNTS, VoxelMap
+from semantic_lidar_fusion.work import Work, in_order
 
 SCANS_PER_PART = 20
-# What does not answer for so long is lost (s).
-DASK_PATIENCE_S = 5.0
 
 
 class Part(NamedTuple):
@@ -160,9 +152,6 @@ def _place_part(part: SubmapPart, header: MapHeader, native: Optional[bool]) -> 
     )
 
 
-Compute = Callable[[AnyPart], PartResult]
-
-
 class Accumulator:
     """Adds up what comes in the order of time, and spills it to files in `folder` beyond
     `memory_bytes`."""
@@ -202,13 +191,6 @@ class Accumulator:
         self._runs = []
 
 
-class Work(NamedTuple):
-    """How to compute: workers > 1 are processes on this machine; scheduler is a Dask address."""
-
-    workers: int = 1
-    scheduler: Optional[str] = None
-
-
 @dataclasses.dataclass
 class Totals:
     clouds: int = 0
@@ -241,7 +223,7 @@ def map_drives(
         compute_part, header_bytes=header.encoded(), keep=writer is not None
     )
     totals = Totals()
-    results = _results(parts, compute, work)
+    results = in_order(parts, compute, work)
     for part, result in zip(parts, cli.progress(results, len(parts), "map")):
         totals.add(result)
         if writer is not None and isinstance(part, Part) and result.submap is not None:
@@ -253,114 +235,6 @@ def map_drives(
             "--tf, or give --poses" % totals.clouds
         )
     return totals
-
-
-def _results(parts: List[AnyPart], compute: Compute, work: Work) -> Iterator[PartResult]:
-    if work.scheduler is not None:
-        return _dask_results(parts, compute, work.scheduler)
-    if work.workers > 1:
-        return _process_results(parts, compute, work.workers)
-    return (compute(part) for part in parts)
-
-
-def _in_order(
-    parts: List[AnyPart],
-    limit: int,
-    submit: Callable[[AnyPart], Any],
-    wait: Callable[[Any], PartResult],
-) -> Iterator[PartResult]:
-    """Results in the order of the parts, with at most `limit` on their way: finished ones hold
-    memory."""
-    remaining: Deque[AnyPart] = collections.deque(parts)
-    flying: Deque[Any] = collections.deque()
-    try:
-        while remaining or flying:
-            while remaining and len(flying) < limit:
-                flying.append(submit(remaining.popleft()))
-            yield wait(flying[0])
-            flying.popleft()
-    finally:
-        for future in flying:
-            future.cancel()
-
-
-def _process_results(parts: List[AnyPart], compute: Compute, workers: int) -> Iterator[PartResult]:
-    with futures.ProcessPoolExecutor(max_workers=workers) as pool:
-        try:
-            yield from _in_order(
-                parts,
-                2 * workers,
-                lambda part: pool.submit(compute, part),
-                lambda future: future.result(),
-            )
-        except futures.process.BrokenProcessPool as error:
-            raise DataError("a worker process died (out of memory?)") from error
-
-
-def _dask_results(parts: List[AnyPart], compute: Compute, scheduler: str) -> Iterator[PartResult]:
-    cli.require("distributed")
-    import logging
-
-    import distributed
-
-    # Its own complaints, a page each, come before the line that says what it means.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
-    logging.getLogger("tornado").setLevel(logging.CRITICAL + 1)
-    try:
-        client = distributed.Client(scheduler, timeout=DASK_PATIENCE_S)
-    except Exception as error:  # whatever an address may be wrong in
-        raise DataError("no Dask scheduler at %s (%s)" % (scheduler, error)) from error
-    try:
-        workers = _dask_workers(client)
-        if not workers:
-            try:
-                client.wait_for_workers(1, timeout=DASK_PATIENCE_S)
-            except Exception as error:
-                raise DataError("the Dask scheduler at %s has no workers" % scheduler) from error
-        yield from _in_order(
-            parts,
-            2 * max(1, workers),
-            lambda part: client.submit(compute, part, pure=False),
-            lambda future: _dask_wait(client, future, scheduler),
-        )
-    finally:
-        try:
-            client.close(timeout=1)
-        except Exception:
-            pass  # a scheduler that is gone cannot be told
-
-
-def _dask_workers(client: Any) -> int:
-    return len(client.scheduler_info().get("workers", {}))
-
-
-def _dask_wait(client: Any, future: Any, scheduler: str) -> PartResult:
-    """The result of a future; DataError if its cluster is lost."""
-    from distributed.comm import CommClosedError
-    from distributed.scheduler import KilledWorker
-
-    good_at = time.monotonic()
-    while not future.done():
-        time.sleep(0.02)
-        alive = client.status == "running"
-        if alive and _dask_workers(client):
-            good_at = time.monotonic()
-        elif time.monotonic() - good_at > DASK_PATIENCE_S:
-            what = (
-                "all workers of the Dask scheduler at %s" if alive else "the Dask scheduler at %s"
-            )
-            raise DataError((what + " are gone" if alive else what + " is gone") % scheduler)
-    try:
-        return future.result(timeout=DASK_PATIENCE_S)  # type: ignore[no-any-return]
-    except ImportError as error:
-        raise DataError(
-            "a Dask worker cannot import the package (%s); start the workers with its setup.bash "
-            "sourced" % error
-        ) from error
-    except KilledWorker as error:
-        raise DataError("Dask workers died again and again (out of memory?)") from error
-    except (futures.CancelledError, CommClosedError, TimeoutError, OSError) as error:
-        raise DataError("the Dask scheduler at %s is gone (%s)" % (scheduler, type(error).__name__)) from error  # fmt: skip
 
 
 class Inputs(NamedTuple):

@@ -17,7 +17,6 @@ from semantic_lidar_fusion.maps.build import (
     Inputs,
     Submaps,
     Totals,
-    Work,
     check_inputs,
     map_drives,
 )
@@ -36,6 +35,7 @@ from semantic_lidar_fusion.maps.output import Exported, OutputFolder, export_map
 from semantic_lidar_fusion.maps.raster import Costs
 from semantic_lidar_fusion.maps.semantic_map import MapConfig
 from semantic_lidar_fusion.maps.submaps import KeptDrive, SubmapReader, SubmapWriter
+from semantic_lidar_fusion.work import Work
 
 
 @dataclasses.dataclass(frozen=True)
