@@ -154,7 +154,11 @@ def make_parser():
     )  # fmt: skip
     work = parser.add_argument_group("the work")
     work.add_argument(
-        "--workers", metavar="N", type=cli.positive, default=1, help="processes here (default: 1)"
+        "--workers",
+        metavar="N",
+        type=cli.positive,
+        default=1,
+        help="processes here, for parts of the drives and then for formats (default: 1)",
     )
     work.add_argument(
         "--scheduler", metavar="ADDRESS", help="an existing Dask cluster, whose workers reach the "

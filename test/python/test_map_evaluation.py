@@ -57,6 +57,6 @@ def test_the_least_nll_is_at_the_weight_that_is_right():
     scores = compare_weights(
         voxels,
         LABELS,
-        TrueVoxels(VoxelIndex(indices), truth.astype(np.uint8), truth.astype(np.uint8), indices),
+        TrueVoxels(VoxelIndex(indices), *[truth.astype(np.uint8)] * 2, indices, np.ones(count)),
     )
     assert min(scores, key=lambda score: score.nll).weight == 0.25

@@ -88,12 +88,14 @@ class VoxelIndex:
 
 
 class TrueVoxels(NamedTuple):
-    """Voxels with their true row (N,) and most frequent true class (N,); `finder` finds them."""
+    """Voxels (N, 3) with their true row (N,), most frequent true class (N,) and number of points (N,);
+    `finder` finds them."""
 
     finder: VoxelIndex
     row: np.ndarray
     label: np.ndarray
     voxels: np.ndarray
+    points: np.ndarray
 
 
 def true_voxels(
@@ -110,14 +112,15 @@ def true_voxels(
         found.append(np.floor(cells).astype(np.int64))
         seen_labels.append(scan.label[usable])
     if not found:
-        return TrueVoxels(VoxelIndex(np.zeros((0, 3), np.int64)), *[np.zeros(0, np.uint8)] * 3)
+        return TrueVoxels(VoxelIndex(np.zeros((0, 3), np.int64)), *[np.zeros(0, np.uint8)] * 4)
     voxels, of = np.unique(np.concatenate(found), axis=0, return_inverse=True)
     label = np.concatenate(seen_labels)
     counts = np.zeros((len(voxels), len(labels)))
     np.add.at(counts, (of.reshape(-1), label), 1.0)
     by_row = counts @ labels.merge_matrix()
     row = np.where(by_row.sum(axis=1) > 0, by_row.argmax(axis=1), NO_LABEL).astype(np.uint8)
-    return TrueVoxels(VoxelIndex(voxels), row, counts.argmax(axis=1).astype(np.uint8), voxels)
+    label = counts.argmax(axis=1).astype(np.uint8)
+    return TrueVoxels(VoxelIndex(voxels), row, label, voxels, counts.sum(axis=1))
 
 
 @dataclasses.dataclass
@@ -145,7 +148,7 @@ class MapScore:
     without_pose: int = 0
 
 
-def _merged(
+def merged_rows(
     probabilities: np.ndarray, label: np.ndarray, labels: LabelSet
 ) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distributions over rows (N, R), predicted row (N,), its confidence (N,), of distributions over
@@ -226,7 +229,7 @@ def score_map(
     score.count = len(named)
     score.strays = _share(int((~hit).sum()), len(named))
     row = np.where(hit, true.row[np.maximum(place, 0)], NO_LABEL)
-    merged, predicted, confidence = _merged(
+    merged, predicted, confidence = merged_rows(
         reading.probabilities[named], reading.label[named], labels
     )
     score.voxels.add(row, predicted)
@@ -265,7 +268,13 @@ def _flat_figures(
     moves = np.isin(true.label[np.maximum(place, 0)], labels.dynamic_ids) & known
     named = known & (label != NO_LABEL)
     taken = named & np.isin(label, labels.dynamic_ids)
+    shown = Confusion(len(labels.evaluation_classes()))
+    chosen = named & (layer != GONE)
+    shown.add(true.row[place[chosen]], labels.merge_lookup()[label[chosen]])
     result = {
+        "mean IoU of voxels that are not gone": float(np.nanmean(iou(shown)))
+        if chosen.any()
+        else math.nan,
         "path occupied": _share(int((flat.cost[near] >= BLOCKED).sum()), int(near.sum())),
         "path unknown": _share(int((flat.cost[near] < 0).sum()), int(near.sum())),
         "dynamic precision": _share(int((taken & moves).sum()), int(taken.sum())),
@@ -288,7 +297,8 @@ def _obstacles_found(
     true: TrueVoxels,
 ) -> Dict[str, float]:
     """Share of the cells that are occupied, of those where something static of each class truly
-    rises, half a voxel inside the heights of obstacles."""
+    rises, half a voxel inside the heights of obstacles: of all, and of those with as many points as
+    the 2-D map asks for, and one more that may lie at a border."""
     x, y = true.voxels[:, 0] - frame.min_x, true.voxels[:, 1] - frame.min_y
     inside = (x >= 0) & (x < frame.width) & (y >= 0) & (y < frame.height)
     cell = np.where(inside, y * frame.width + x, 0)
@@ -300,10 +310,13 @@ def _obstacles_found(
     for number, info in enumerate(labels.classes):
         if info.dynamic or costs.ground[number] or costs.cost[number] < OCCUPIED:
             continue
-        cells = np.unique(cell[rises & (true.label == number)])
-        if len(cells):
-            found = cost.reshape(-1)[cells] >= BLOCKED
-            result["found: " + info.name] = float(found.mean())
+        own = rises & (true.label == number)
+        cells, of = np.unique(cell[own], return_inverse=True)
+        points = np.bincount(of, true.points[own], len(cells))
+        found = cost.reshape(-1)[cells] >= BLOCKED
+        for name, least in (("found: ", costs.min_points + 1), ("found, any: ", 1)):
+            if (points >= least).any():
+                result[name + info.name] = float(found[points >= least].mean())
     return result
 
 
@@ -337,7 +350,7 @@ def _score_points(
             (cloud.probabilities[chosen], cloud.label[chosen], score.scan, score.scan_reliability),
             (reading.probabilities[at], reading.label[at], score.fused, score.fused_reliability),
         ):
-            merged, predicted, confidence = _merged(probabilities, label, labels)
+            merged, predicted, confidence = merged_rows(probabilities, label, labels)
             confusion.add(row, predicted)
             reliability.add(merged, row, predicted, confidence)
 
@@ -365,7 +378,7 @@ def compare_weights(voxels: VoxelMap, labels: LabelSet, true: TrueVoxels) -> Lis
         scaled["evidence"] = np.rint(records["evidence"] * factor).astype(np.int64)
         p = distributions(scaled, voxels.config, labels)
         reliability = Reliability()
-        merged, predicted, confidence = _merged(p, label, labels)
+        merged, predicted, confidence = merged_rows(p, label, labels)
         reliability.add(merged, row, predicted, confidence)
         result.append(WeightScore(weight, reliability.nll, reliability.ece, reliability.brier))
     return result

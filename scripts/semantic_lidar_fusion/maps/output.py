@@ -4,9 +4,11 @@
 import contextlib
 import glob
 import json
+import multiprocessing
 import os
 import shutil
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence
+from concurrent import futures
+from typing import Any, Dict, Iterator, List, NamedTuple, Optional, Sequence, Union
 
 from semantic_lidar_fusion.errors import DataError, SemanticLidarFusionError, cannot_write
 from semantic_lidar_fusion.maps import formats
@@ -87,19 +89,20 @@ def export_map(
     title: str,
     facts: Dict[str, Any],
     epsg: Optional[int] = None,
+    workers: int = 1,
 ) -> Exported:
     """Exports MAP_FILE of a folder beside it, and writes ABOUT_FILE. A format that fails leaves the
-    others alone: its files are removed, its reason is returned."""
+    others alone: its files are removed, its reason is returned. workers > 1: so many processes share
+    the formats."""
     source = MapSource(MapReader(os.path.join(folder, MAP_FILE)), costs, title, epsg)
     about: Dict[str, Any] = {}
     failed: Dict[str, str] = {}
-    for name in wanted:
-        entry = formats.find(name)
-        try:
-            about.update(entry.load()(source, folder))
-        except (SemanticLidarFusionError, OSError, MemoryError, ImportError) as error:
-            failed[name] = str(error) or type(error).__name__
-            _remove_files(entry, folder)
+    for name, result in zip(wanted, _written(source, folder, wanted, workers)):
+        if isinstance(result, str):
+            failed[name] = result
+            _remove_files(formats.find(name), folder)
+        else:
+            about.update(result)
     header = source.header
     counts = dict(zip(("static", "dynamic", "gone"), source.extent.counts))
     about.update(
@@ -120,6 +123,43 @@ def export_map(
     except OSError as error:
         failed["about"] = str(error)
     return Exported(counts, failed)
+
+
+def _written(
+    source: MapSource, folder: str, wanted: Sequence[str], workers: int
+) -> Iterator[Union[str, Dict[str, Any]]]:
+    """What became of each format: what map.json should say, or why it failed."""
+    if workers <= 1 or len(wanted) < 2:
+        yield from (_write(source, name, folder) for name in wanted)
+        return
+    # New processes: a copy of this one would lack the threads that OpenCV believes to have.
+    context = multiprocessing.get_context("spawn")
+    given = (source.reader.path_name, source.costs, source.title, source.epsg)
+    with futures.ProcessPoolExecutor(workers, context, _open_source, given) as pool:
+        flying = [pool.submit(_write_here, name, folder) for name in wanted]
+        for future in flying:
+            try:
+                yield future.result()
+            except futures.process.BrokenProcessPool:
+                yield "its process died (out of memory?)"
+
+
+def _write(source: MapSource, name: str, folder: str) -> Union[str, Dict[str, Any]]:
+    try:
+        return formats.find(name).load()(source, folder)
+    except (SemanticLidarFusionError, OSError, MemoryError, ImportError) as error:
+        return str(error) or type(error).__name__
+
+
+_opened: Dict[str, MapSource] = {}  # of a process that writes formats
+
+
+def _open_source(path: str, costs: Costs, title: str, epsg: Optional[int]) -> None:
+    _opened["source"] = MapSource(MapReader(path), costs, title, epsg)
+
+
+def _write_here(name: str, folder: str) -> Union[str, Dict[str, Any]]:
+    return _write(_opened["source"], name, folder)
 
 
 def _remove_files(entry: Format, folder: str) -> None:

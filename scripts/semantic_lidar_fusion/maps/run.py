@@ -97,7 +97,8 @@ def _fill(request: Request, folder: str, wanted: List[str]) -> Tuple[MapHeader, 
         header.config.voxel_size_m,
         header.frame_id,
     )
-    exported = export_map(folder, wanted, costs, title, facts, request.epsg)
+    workers = request.work.workers
+    exported = export_map(folder, wanted, costs, title, facts, request.epsg, workers)
     if request.scan_labels:
         _label_scans(request, folder, exported)
     return header, totals, exported

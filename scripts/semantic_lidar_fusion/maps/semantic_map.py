@@ -45,7 +45,7 @@ class MapConfig:
     weight: float = 1.0
     floor: float = 1e-2
     prior: Optional[Tuple[float, ...]] = None
-    clamp: float = 5.0
+    clamp: float = 4.5
     min_range_m: float = 0.0
     max_range_m: float = 120.0
     ray_range_m: float = 45.0
