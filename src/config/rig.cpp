@@ -181,6 +181,15 @@ ShutterConfig readShutter(YamlSection section) {
   return shutter;
 }
 
+RowBand readRows(YamlSection section) {
+  RowBand rows;
+  section.number("first", &rows.first, {0, 1});
+  section.number("last", &rows.last, {0, 1});
+  if (!(rows.first < rows.last)) section.problem("last", "must be above `first`");
+  section.finish();
+  return rows;
+}
+
 CameraConfig readCamera(const YAML::Node& node, std::size_t index,
                         const std::string& base_directory, Problems* problems, YamlTree* list) {
   CameraConfig camera;
@@ -217,6 +226,7 @@ CameraConfig readCamera(const YAML::Node& node, std::size_t index,
   if (camera.score_format.scale == 0) section.problem("score_scale", "must not be 0");
   section.number("score_offset", &camera.score_format.offset);
   section.number("max_theta_deg", &camera.max_theta_deg, {0, 180});
+  camera.lidar_rows = readRows(section.child("lidar_rows"));
   camera.lens = readLens(section.child("lens"), base_directory, problems);
   if (camera.lens.calibration && camera.rectified) {
     section.problem("lens", "must be left out where `rectified` is true");

@@ -7,19 +7,20 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-SlicConfig slicConfig(const SuperpixelConfig& config) {
+SlicConfig slicConfig(const SuperpixelConfig& config, const RowBand& rows) {
   SlicConfig slic;
   slic.count = config.count;
   slic.compactness = config.compactness;
   slic.iterations = config.iterations;
   slic.warm_start = config.warm_start;
+  slic.rows = rows;
   return slic;
 }
 
 }  // namespace
 
-CameraSuperpixels::CameraSuperpixels(const SuperpixelConfig& config)
-    : config_(config), slic_(slicConfig(config)) {}
+CameraSuperpixels::CameraSuperpixels(const SuperpixelConfig& config, const RowBand& lidar_rows)
+    : config_(config), slic_(slicConfig(config, lidar_rows)) {}
 
 std::optional<ImageSize> CameraSuperpixels::mapSize(const ImageSize& image) const {
   if (config_.scale <= 0) return scores_size_;
@@ -28,7 +29,7 @@ std::optional<ImageSize> CameraSuperpixels::mapSize(const ImageSize& image) cons
 }
 
 std::string CameraSuperpixels::clampNote(const ImageSize& map_size) const {
-  const int most = clampedSuperpixelCount(slicConfig(config_), map_size);
+  const int most = clampedSuperpixelCount(slicConfig(config_, {}), map_size);
   if (most >= config_.count) return {};
   return "superpixels.count = " + std::to_string(config_.count) + ": a map of " +
          sizeText(map_size) + " pixels holds no more than " + std::to_string(most) +

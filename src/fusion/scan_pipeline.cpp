@@ -78,8 +78,8 @@ ScanPipeline::ScanPipeline(const Rig& rig, const PipelineSteps& steps) : rig_(ri
   if (has(PipelineStep::kView)) ego_masks_ = loadEgoMasks(rig_.cameras);
   if (has(PipelineStep::kSegment)) {
     segmentation_ = std::make_unique<Segmentation>();
-    for (std::size_t i = 0; i < rig_.cameras.size(); ++i) {
-      segmentation_->cameras.emplace_back(rig_.superpixels);
+    for (const CameraConfig& camera : rig_.cameras) {
+      segmentation_->cameras.emplace_back(rig_.superpixels, camera.lidar_rows);
     }
     if (has(PipelineStep::kNetwork) && !rig_.segmentation.model.empty()) {
       segmentation_->model =

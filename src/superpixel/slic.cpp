@@ -75,6 +75,48 @@ SeedGrid makeSeedGrid(const ImageSize& size, int count) {
   return grid;
 }
 
+/// Whole rows of blocks that hold the band, one at least.
+cv::Range rowsOf(const RowBand& band, int height) {
+  const double blocks = static_cast<double>(height) / kBlockHeight;
+  const int last_block = (height - 1) / kBlockHeight;
+  const int first = std::min(static_cast<int>(band.first * blocks), last_block);
+  const int end = std::max(first + 1, static_cast<int>(std::ceil(band.last * blocks)));
+  return {first * kBlockHeight, std::min(end * kBlockHeight, height)};
+}
+
+/// The seeds of the whole map that lie in some of its rows, counted from the first of these.
+SeedGrid makeSeedGrid(const ImageSize& whole, const cv::Range& rows, int count) {
+  SeedGrid grid = makeSeedGrid(whole, count);
+  if (rows.size() == whole.height) return grid;
+  std::vector<std::pair<int, int>> inside;
+  for (const auto& [x, y] : grid.positions) {
+    if (rows.start <= y && y < rows.end) inside.emplace_back(x, y - rows.start);
+  }
+  // Rows between two rows of seeds.
+  if (inside.empty()) {
+    const std::int64_t part = static_cast<std::int64_t>(count) * rows.size() / whole.height;
+    inside =
+        makeSeedGrid({whole.width, rows.size()}, std::max(1, static_cast<int>(part))).positions;
+  }
+  grid.positions = std::move(inside);
+  return grid;
+}
+
+/// A map of some rows as a map of `height` rows, of which those outside repeat the nearest.
+SuperpixelMap extended(SuperpixelMap map, const cv::Range& rows, int height) {
+  cv::Mat ids(height, map.ids.cols, CV_32SC1);
+  map.ids.copyTo(ids.rowRange(rows));
+  for (int y = 0; y < height; ++y) {
+    const int nearest = std::min(std::max(y, rows.start), rows.end - 1);
+    if (nearest == y) continue;
+    ids.row(nearest).copyTo(ids.row(y));
+    for (int x = 0; x < ids.cols; ++x) ++map.sizes[ids.at<int>(y, x)];
+  }
+  map.ids = ids;
+  map.rows = rows;
+  return map;
+}
+
 std::uint64_t roundedMean(std::uint64_t sum, std::uint64_t count) {
   return (2 * sum + count) / (2 * count);
 }
@@ -90,10 +132,11 @@ class Slic::Engine {
     kernels_ = usable.kernels[usable.count - 1];
   }
 
-  SuperpixelMap cluster(const cv::Mat& image, const ImageSize& size,
+  /// Superpixels of the rows `rows` of a map of `whole` size.
+  SuperpixelMap cluster(const cv::Mat& image, const ImageSize& whole, const cv::Range& rows,
                         const std::optional<StampNs>& stamp) {
-    started_warm_ = followsLast(image, size, stamp);
-    if (size != size_) allocate(size);
+    started_warm_ = followsLast(image, whole, stamp);
+    if (whole != whole_) allocate(whole, rows);
     loadPlanes(image);
     if (started_warm_) {
       const std::uint64_t last_residual = residual_;
@@ -116,18 +159,20 @@ class Slic::Engine {
   bool startedWarm() const { return started_warm_; }
 
  private:
-  bool followsLast(const cv::Mat& image, const ImageSize& size,
+  bool followsLast(const cv::Mat& image, const ImageSize& whole,
                    const std::optional<StampNs>& stamp) const {
-    if (!config_.warm_start || !has_last_ || size != size_ || image.channels() != channels_) {
+    if (!config_.warm_start || !has_last_ || whole != whole_ || image.channels() != channels_) {
       return false;
     }
     if (!stamp || !last_stamp_) return true;
     return *stamp > *last_stamp_ && *stamp - *last_stamp_ <= kMaxWarmGapNs;
   }
 
-  void allocate(const ImageSize& size) {
+  void allocate(const ImageSize& whole, const cv::Range& rows) {
+    const ImageSize size{whole.width, rows.size()};
+    whole_ = whole;
+    first_row_ = rows.start;
     size_ = size;
-    const int count = clampedSuperpixelCount(config_, size);
     block_columns_ = (size.width + kBlockWidth - 1) / kBlockWidth;
     block_rows_ = (size.height + kBlockHeight - 1) / kBlockHeight;
     stride_ = block_columns_ * kBlockWidth;
@@ -140,7 +185,7 @@ class Slic::Engine {
     candidate_counts_.assign(static_cast<std::size_t>(block_columns_) * block_rows_, 0);
     candidate_ids_.assign(candidate_counts_.size() * kMaxCandidates, 0);
 
-    grid_ = makeSeedGrid(size, count);
+    grid_ = makeSeedGrid(whole, rows, clampedSuperpixelCount(config_, whole));
     // With fewer rows some iterations could find none to visit.
     row_step_ = size.height < 2 * kRowStep ? 1 : kRowStep;
     reach_ = static_cast<int>(std::lround(kReach * grid_.cell));
@@ -164,8 +209,8 @@ class Slic::Engine {
   void loadPlanes(const cv::Mat& image) {
     channels_ = image.channels();
     const ImageSize source{image.cols, image.rows};
-    if (!reduction_.fits(source, size_, channels_)) {
-      reduction_ = BoxReduction(source, size_, channels_);
+    if (!reduction_.fits(source, whole_, channels_)) {
+      reduction_ = BoxReduction(source, whole_, channels_);
     }
     // Rows y - 1, y and y + 1 of each plane; a row beyond the image is that at its border.
     const int last = size_.height - 1;
@@ -188,7 +233,7 @@ class Slic::Engine {
   }
 
   void loadRow(const cv::Mat& image, int y) {
-    const std::uint8_t* row = reduction_.row(image, y, *kernels_);
+    const std::uint8_t* row = reduction_.row(image, first_row_ + y, *kernels_);
     std::uint8_t* const planes[3] = {rawRow(0, y), rawRow(1, y), rawRow(2, y)};
     if (channels_ == 1) {
       // The opponent colours of grey.
@@ -423,7 +468,9 @@ class Slic::Engine {
   const SlicKernels* kernels_;
 
   // Depend on the size of the map alone.
-  ImageSize size_;
+  ImageSize whole_;
+  int first_row_ = 0;  ///< of the map that is clustered
+  ImageSize size_;     ///< of what is clustered
   int block_columns_ = 0, block_rows_ = 0;
   int stride_ = 0;  ///< of planes and indices: whole blocks
   int row_step_ = 1;
@@ -462,7 +509,7 @@ int clampedSuperpixelCount(const SlicConfig& config, const ImageSize& map_size) 
   return static_cast<int>(std::min<std::int64_t>(std::max(1, config.count), most));
 }
 
-Slic::Slic(const SlicConfig& config) {
+Slic::Slic(const SlicConfig& config) : config_(config) {
   std::vector<std::string> problems;
   if (config.count < 1) {
     problems.push_back("superpixels.count is " + std::to_string(config.count) +
@@ -475,6 +522,11 @@ Slic::Slic(const SlicConfig& config) {
   if (config.iterations < 1 || config.iterations > 100) {
     problems.push_back("superpixels.iterations is " + std::to_string(config.iterations) +
                        ", must be 1..100");
+  }
+  if (!(config.rows.first >= 0.0 && config.rows.first < config.rows.last &&
+        config.rows.last <= 1.0)) {
+    problems.push_back("superpixel rows are " + std::to_string(config.rows.first) + " to " +
+                       std::to_string(config.rows.last) + ", must ascend within 0..1");
   }
   if (!problems.empty()) throw ConfigError(problems);
   engine_ = std::make_unique<Engine>(config);
@@ -493,7 +545,9 @@ SuperpixelMap Slic::cluster(const cv::Mat& image, const ImageSize& map_size,
   if (map_size.width < 1 || map_size.height < 1) {
     throw DataError("superpixel map size is " + sizeText(map_size) + ", must be at least 1x1");
   }
-  return engine_->cluster(image, map_size, stamp);
+  const cv::Range rows = rowsOf(config_.rows, map_size.height);
+  SuperpixelMap map = engine_->cluster(image, map_size, rows, stamp);
+  return rows.size() < map_size.height ? extended(std::move(map), rows, map_size.height) : map;
 }
 
 void Slic::reset() { engine_->reset(); }

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <numeric>
 #include <string>
@@ -56,14 +57,16 @@ struct SampledCells {
   std::vector<int> place;  ///< of each column's cell in `cells`
 };
 
-/// A map cut into pieces of one superpixel and one label within a row, as they were counted.
+/// The clustered rows of a map, cut into pieces of one superpixel and one label within a row, as
+/// they were counted.
 struct Segments {
-  std::vector<int> row_first;  ///< of each row, and the end
+  std::vector<int> row_first;  ///< of each clustered row, and the end
   std::vector<int> begins;     ///< columns
 };
 
-/// Lets every pixel of the map vote. `label_row(row, cells, labels)` writes the labels of the given
-/// cells of a source row, or kNoVote; it is asked once per needed row. Returns the votes withheld.
+/// Lets every pixel of the map's clustered rows vote. `label_row(row, cells, labels)` writes the
+/// labels of the given cells of a source row, or kNoVote; it is asked once per needed row. Returns
+/// the votes withheld.
 template <typename LabelRow>
 std::size_t vote(const SuperpixelMap& superpixels, const ImageSize& source, LabelRow&& label_row,
                  Histogram* histogram, Segments* segments) {
@@ -75,7 +78,7 @@ std::size_t vote(const SuperpixelMap& superpixels, const ImageSize& source, Labe
   int labelled_row = -1;
   segments->row_first.assign(1, 0);
   segments->begins.clear();
-  for (int y = 0; y < ids.rows; ++y) {
+  for (int y = superpixels.firstRow(); y < superpixels.endRow(); ++y) {
     const int row = cellUnderCentre(y, ids.rows, source.height);
     if (row != labelled_row) {
       label_row(row, sampled.cells, cell_labels.data());
@@ -104,13 +107,14 @@ cv::Mat paint(const SuperpixelMap& superpixels, const Segments& segments,
               const std::vector<float>& values) {
   constexpr int kStep = 8;
   cv::Mat image(superpixels.ids.size(), CV_32FC1);
-  for (int y = 0; y < image.rows; ++y) {
+  const int first = superpixels.firstRow(), end_row = superpixels.endRow();
+  for (int y = first; y < end_row; ++y) {
     const int* id = superpixels.ids.ptr<int>(y);
     float* out = image.ptr<float>(y);
     // Whole steps may write beyond a segment: what comes after it is written after it.
     const bool room = y + 1 < image.rows && image.cols >= kStep;
-    const int last = segments.row_first[y + 1] - 1;
-    for (int i = segments.row_first[y]; i <= last; ++i) {
+    const int last = segments.row_first[y - first + 1] - 1;
+    for (int i = segments.row_first[y - first]; i <= last; ++i) {
       const int begin = segments.begins[i], end = i < last ? segments.begins[i + 1] : image.cols;
       const float value = values[id[begin]];
       if (!room) {
@@ -121,6 +125,11 @@ cv::Mat paint(const SuperpixelMap& superpixels, const Segments& segments,
         for (int k = 0; k < kStep; ++k) out[x + k] = value;
       }
     }
+  }
+  const std::size_t bytes = sizeof(float) * static_cast<std::size_t>(image.cols);
+  for (int y = 0; y < image.rows; ++y) {
+    const int nearest = std::min(std::max(y, first), end_row - 1);
+    if (nearest != y) std::memcpy(image.ptr(y), image.ptr(nearest), bytes);
   }
   return image;
 }

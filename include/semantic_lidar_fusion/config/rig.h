@@ -53,6 +53,7 @@ struct CameraConfig {
   std::string mask;          ///< path of an 8-bit image, 0 = never transfer; empty = none
   ScoreFormat score_format;  ///< keys score_scale, score_offset
   double max_theta_deg = 0.0;
+  RowBand lidar_rows;  ///< that the lidar's points can reach
   LensFileConfig lens;
   ShutterConfig shutter;
   double time_offset_s = 0.0;           ///< key time_offset

@@ -15,8 +15,8 @@ namespace semantic_lidar_fusion {
 /// Superpixels of one camera's images, in the order in which the images are given. Not thread-safe.
 class CameraSuperpixels {
  public:
-  /// Throws ConfigError.
-  explicit CameraSuperpixels(const SuperpixelConfig& config);
+  /// `lidar_rows`: those in which superpixels are wanted. Throws ConfigError.
+  explicit CameraSuperpixels(const SuperpixelConfig& config, const RowBand& lidar_rows = {});
 
   /// Size of the superpixel map of an image: floor(image * scale), at least 1 x 1; without a scale
   /// the size of the scores, which is empty until scores were seen.

@@ -23,6 +23,10 @@ struct SlicConfig {
   /// but the map then depends on the images before. Falls back to a cold start on a scene cut,
   /// another size or number of channels, and a stamp that goes back or jumps.
   bool warm_start = false;
+  /// The part of the map that is clustered, 0..1, with its part of `count`: the blocks of 16 rows
+  /// that hold it. The other rows repeat the nearest of them. Superpixels in it are those of the
+  /// whole map as far as those at its border do not push them.
+  RowBand rows;
 };
 
 /// Number of superpixels that `cluster` aims at: `config.count` clamped to 1..pixels / 64.
@@ -40,9 +44,10 @@ class Slic {
   /// `image`: CV_8UC1 or CV_8UC3 (BGR), any size from 1x1. The map has `map_size`, the image being
   /// brought to it by averaging over each map pixel's box (exact, also for a map that is larger).
   /// `stamp`, if given, is the image's time (ns) and limits the warm start to images that follow
-  /// each other within kMaxWarmGapNs. Obtains clampedSuperpixelCount within 10 %; ids are in raster
-  /// order of first appearance. Deterministic: equal sequences of images give equal maps on every
-  /// machine. Throws DataError on an empty image, another type, or a map size below 1x1.
+  /// each other within kMaxWarmGapNs. Obtains clampedSuperpixelCount within 10 % (that part of it
+  /// which `rows` are of the map); ids are in raster order of first appearance. Deterministic:
+  /// equal sequences of images give equal maps on every machine. Throws DataError on an empty
+  /// image, another type, or a map size below 1x1.
   SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size,
                         std::optional<StampNs> stamp = std::nullopt);
 
@@ -56,6 +61,7 @@ class Slic {
 
  private:
   class Engine;
+  SlicConfig config_;
   std::unique_ptr<Engine> engine_;
 };
 

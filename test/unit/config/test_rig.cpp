@@ -101,7 +101,7 @@ classes: {classes: [{name: road, color: [1, 2, 3]}]}
 cameras:
   - {name: c0, namespace: /a/b, image: i, camera_info: ci, scores: s, transport: compressed,
      rectified: true, input: probabilities, mask: usyd.yaml, score_scale: -0.5, score_offset: 3,
-     max_theta_deg: 50, time_offset: 0.25, max_time_difference: 0, timeout: 1.5,
+     max_theta_deg: 50, lidar_rows: {first: 0.25, last: 0.75}, time_offset: 0.25, max_time_difference: 0, timeout: 1.5,
      reorder_window: 0.1}
   - {name: c1}
 lidar: {input: points, topic: /ouster/points, model: VLP-32C, frame: /os, min_range_m: 1,
@@ -140,6 +140,8 @@ threads: 3
   EXPECT_EQ(camera.score_format.scale, -0.5);
   EXPECT_EQ(camera.score_format.offset, 3);
   EXPECT_EQ(camera.max_theta_deg, 50);
+  EXPECT_EQ(camera.lidar_rows.first, 0.25);
+  EXPECT_EQ(camera.lidar_rows.last, 0.75);
   EXPECT_EQ(camera.time_offset_s, 0.25);
   EXPECT_EQ(camera.max_time_difference_s, 0);
   EXPECT_EQ(camera.timeout_s, 1.5);
@@ -394,6 +396,10 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
            {"[{name: A0, score_scale: 0}]", "rig.yaml: cameras.A0.score_scale = 0: must not be 0"},
            {"[{name: A0, score_offset: .nan}]", "rig.yaml: cameras.A0.score_offset = .nan: must"},
            {"[{name: A0, max_theta_deg: 181}]", "rig.yaml: cameras.A0.max_theta_deg = 181: must"},
+           {"[{name: A0, lidar_rows: {last: 1.1}}]",
+            "rig.yaml: cameras.A0.lidar_rows.last = 1.1: must"},
+           {"[{name: A0, lidar_rows: {first: 0.5, last: 0.5}}]",
+            "rig.yaml: cameras.A0.lidar_rows.last = 0.5: must be above `first`"},
            {"[{name: A0, lens: {file: no.yaml}}]",
             "rig.yaml: cameras.A0.lens.file = no.yaml: must be a readable file; '"},
            {"[{name: A0, lens: {camera: cam0}}]",

@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include <limits>
+#include <map>
 #include <opencv2/imgcodecs.hpp>
 #include <opencv2/imgproc.hpp>
 #include <string>
@@ -247,6 +248,59 @@ TEST(SlicWarmStart, SurvivesImagesWithoutContent) {
 
 // On real photographs with human labels, the plain measure of how much superpixels straddle
 // segments is no worse than that of OpenCV's SLIC at the same number of superpixels.
+/// Whether rows of two maps are cut alike, whatever the ids.
+bool sameCut(const cv::Mat& a, const cv::Mat& b) {
+  std::map<int, int> to_b, to_a;
+  for (int y = 0; y < a.rows; ++y) {
+    for (int x = 0; x < a.cols; ++x) {
+      const int id_a = a.at<int>(y, x), id_b = b.at<int>(y, x);
+      if (to_b.emplace(id_a, id_b).first->second != id_b) return false;
+      if (to_a.emplace(id_b, id_a).first->second != id_a) return false;
+    }
+  }
+  return true;
+}
+
+TEST(Slic, ABandIsCutAsTheWholeMapAwayFromItsBorder) {
+  // Ten rows of ten cells of 32 px; a cluster reaches 24 px beyond its centre.
+  const cv::Mat image = patchImage(640, 640, CV_8UC3, 4);
+  SlicConfig config = withCount(100);
+  config.iterations = 1;
+  const SuperpixelMap whole = Slic(config).cluster(image, {320, 320});
+  config.rows = {0.21, 0.79};
+  const SuperpixelMap map = Slic(config).cluster(image, {320, 320});
+  ASSERT_EQ(map.rows, cv::Range(64, 256));
+  expectValidMap(map, 320, 320);
+  expectCountWithinTenPercent(map.count, 60);
+  // The border moves the first row of clusters, these those behind them in the assignment.
+  EXPECT_TRUE(sameCut(map.ids.rowRange(136, 184), whole.ids.rowRange(136, 184)));
+  EXPECT_FALSE(sameCut(map.ids, whole.ids));
+  for (int y = 0; y < 320; ++y) {
+    const int nearest = std::min(std::max(y, 64), 255);
+    EXPECT_EQ(cv::norm(map.ids.row(y), map.ids.row(nearest), cv::NORM_INF), 0.0) << y;
+  }
+}
+
+TEST(Slic, BandsOfEveryHeightGiveValidMaps) {
+  for (const RowBand& band : {RowBand{0.0, 0.001}, RowBand{0.999, 1.0}, RowBand{0.31, 0.32},
+                              RowBand{0.5, 1.0}, RowBand{0.0, 1.0}}) {
+    for (const auto& [size, count] :
+         {std::pair<ImageSize, int>{{1, 1}, 5}, {{64, 48}, 20}, {{3, 500}, 9}, {{201, 151}, 6}}) {
+      SlicConfig config = withCount(count);
+      config.rows = band;
+      const cv::Mat image = patchImage(97, 77, CV_8UC1, 5);
+      const SuperpixelMap map = Slic(config).cluster(image, size);
+      expectValidMap(map, size.width, size.height);
+      EXPECT_LT(map.firstRow(), map.endRow());
+      EXPECT_LE(map.firstRow(), band.first * size.height);
+      EXPECT_GE(map.endRow(), band.last * size.height);
+    }
+  }
+  SlicConfig config;
+  config.rows = {0.5, 0.5};
+  EXPECT_THROW(Slic{config}, ConfigError);
+}
+
 TEST(Slic, UndersegmentsCamvidNoMoreThanOpenCv) {
   SLF_SKIP_WITHOUT("data/camvid/Seq05VD_f00540.png");
 #ifndef SLF_TEST_XIMGPROC

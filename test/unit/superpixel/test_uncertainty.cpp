@@ -415,6 +415,26 @@ TEST(Share, NonFiniteCellsHaveNoVoteAndAreCountedPerMapPixel) {
   EXPECT_GT(p.at<cv::Vec3f>(1, 1)[1], 0.5F);
 }
 
+TEST(Share, OfABandCountsItsRowsAndGoesOnBeyond) {
+  const cv::Mat scores = randomScores(30, 20, 5, 31);
+  SuperpixelMap map = blockMap(30, 20, 5);
+  for (int y = 0; y < 20; ++y) {
+    const int nearest = std::min(std::max(y, 5), 14);
+    if (nearest != y) map.ids.row(nearest).copyTo(map.ids.row(y));
+  }
+  map.rows = {5, 15};
+  const ShareMap share = computeShare(map, ScoreMap(scores, 5, {}));
+  SuperpixelMap cut;
+  cut.ids = map.ids.rowRange(5, 15).clone();
+  cut.count = map.count;
+  const ShareMap expected = computeShare(cut, ScoreMap(scores.rowRange(5, 15).clone(), 5, {}));
+  EXPECT_EQ(share.superpixel, expected.superpixel);
+  for (int y = 0; y < 20; ++y) {
+    const int row = std::min(std::max(y - 5, 0), 9);
+    EXPECT_EQ(cv::norm(share.share.row(y), expected.share.row(row), cv::NORM_INF), 0.0) << y;
+  }
+}
+
 TEST(Share, TiesGoToTheLowestClass) {
   const SuperpixelMap map = makeMap(3, 1, {0, 0, 0});
   cv::Mat scores(1, 3, CV_32FC2, cv::Scalar::all(4.0));  // ties: class 0
