@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <map>
 #include <memory>
 #include <opencv2/calib3d.hpp>
 #include <opencv2/core/utility.hpp>
@@ -14,6 +15,7 @@
 #include <opencv2/imgproc.hpp>
 #include <random>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "benchmark_main.h"
@@ -28,35 +30,41 @@ constexpr double kPi = 3.14159265358979323846;
 constexpr int kCameras = 5;
 constexpr int kClasses = 12;
 
-/// A turn of a VLP-16 in a street of facades with cars and poles, second returns left out.
-const Cloud& scan() {
-  static const Cloud made = [] {
-    Cloud cloud;
-    std::mt19937 random(1);
-    std::normal_distribution<double> noise(0.0, 0.01);
-    for (int step = 0; step < 1800; ++step) {
-      const double azimuth = -step * 0.2 * kPi / 180.0;
-      const double facade = 9.0 / std::max(0.15, std::abs(std::sin(azimuth)));
-      const bool car = step / 40 % 4 == 0, pole = step % 90 < 3;
-      for (int ring = 0; ring < 16; ++ring) {
-        const double elevation = (2.0 * ring - 15.0) * kPi / 180.0;
-        double range = facade / std::cos(elevation);
-        if (car && elevation < 0.0) range = std::min(range, 7.0);
-        if (pole) range = std::min(range, 5.0);
-        if (elevation < 0.0) range = std::min(range, 1.7 / std::sin(-elevation));
-        if (range > 100.0 || random() % 40 == 0) continue;
-        range += noise(random);
-        cloud.x.push_back(static_cast<float>(range * std::cos(elevation) * std::cos(azimuth)));
-        cloud.y.push_back(static_cast<float>(range * std::cos(elevation) * std::sin(azimuth)));
-        cloud.z.push_back(static_cast<float>(range * std::sin(elevation)));
-        cloud.ring.push_back(static_cast<std::uint16_t>(ring));
-        cloud.dt.push_back(static_cast<float>(step * 0.1 / 1800 - 0.05));
-      }
+/// A lidar's turn in a street of facades with cars and poles, second returns left out. Its rings
+/// are evenly spread over 30 deg.
+Cloud turnOf(int rings, int steps) {
+  Cloud cloud;
+  std::mt19937 random(1);
+  std::normal_distribution<double> noise(0.0, 0.01);
+  for (int step = 0; step < steps; ++step) {
+    const double degrees = 360.0 * step / steps;
+    const double azimuth = -degrees * kPi / 180.0;
+    const double facade = 9.0 / std::max(0.15, std::abs(std::sin(azimuth)));
+    const bool car = static_cast<int>(degrees / 8.0) % 4 == 0,
+               pole = std::fmod(degrees, 18.0) < 0.6;
+    for (int ring = 0; ring < rings; ++ring) {
+      const double elevation = (30.0 * ring / (rings - 1) - 15.0) * kPi / 180.0;
+      double range = facade / std::cos(elevation);
+      if (car && elevation < 0.0) range = std::min(range, 7.0);
+      if (pole) range = std::min(range, 5.0);
+      if (elevation < 0.0) range = std::min(range, 1.7 / std::sin(-elevation));
+      if (range > 100.0 || random() % 40 == 0) continue;
+      range += noise(random);
+      cloud.x.push_back(static_cast<float>(range * std::cos(elevation) * std::cos(azimuth)));
+      cloud.y.push_back(static_cast<float>(range * std::cos(elevation) * std::sin(azimuth)));
+      cloud.z.push_back(static_cast<float>(range * std::sin(elevation)));
+      cloud.ring.push_back(static_cast<std::uint16_t>(ring));
+      cloud.dt.push_back(static_cast<float>(step * 0.1 / steps - 0.05));
     }
-    cloud.intensity.assign(cloud.x.size(), 0.0f);
-    cloud.status.assign(cloud.x.size(), 0);
-    return cloud;
-  }();
+  }
+  cloud.intensity.assign(cloud.x.size(), 0.0f);
+  cloud.status.assign(cloud.x.size(), 0);
+  return cloud;
+}
+
+/// A turn of a VLP-16.
+const Cloud& scan() {
+  static const Cloud made = turnOf(16, 1800);
   return made;
 }
 
@@ -248,6 +256,103 @@ BENCHMARK_CAPTURE(fuseRig, two_threads, &OcclusionMode::kAdaptive, 2)
     ->Name("fuse_five_cameras/ours_adaptive_two_threads")
     ->UseRealTime()
     ->Unit(benchmark::kMicrosecond);
+
+/// The turns of the rows below, which are made once each.
+const Cloud& turnOf(const benchmark::State& state) {
+  static std::map<std::pair<std::int64_t, std::int64_t>, Cloud> made;
+  const std::pair<std::int64_t, std::int64_t> key{state.range(0), state.range(1)};
+  auto found = made.find(key);
+  if (found == made.end()) {
+    const Cloud cloud = turnOf(static_cast<int>(key.first), static_cast<int>(key.second));
+    found = made.emplace(key, cloud).first;
+  }
+  return found->second;
+}
+
+/// The lidar's part of a scan: beam grid, projection, masks, transfer and merging. Arguments:
+/// rings, steps of a turn, cameras, classes.
+void lidarOurs(benchmark::State& state) {
+  const Cloud& cloud = turnOf(state);
+  const auto cameras = static_cast<int>(state.range(2)), classes = static_cast<int>(state.range(3));
+  const auto model = std::make_shared<const CameraModel>(lens(), CameraModelOptions{});
+  cv::RNG random(3);
+  std::vector<CameraView> views;
+  for (int c = 0; c < cameras; ++c) {
+    cv::Mat scores(151, 240, CV_32FC(classes)), share(151, 240, CV_32FC1);
+    random.fill(scores.reshape(1), cv::RNG::NORMAL, 0.0, 4.0);
+    random.fill(share, cv::RNG::UNIFORM, 0.3, 1.0);
+    CameraView view;
+    view.name = std::string(1, static_cast<char>('A' + c));
+    view.rig_index = c;
+    view.model = model;
+    view.T_camera_lidar = view.T_camera_lidar_static = cameraFromLidar(360.0 / cameras * c);
+    view.has_image = true;
+    view.semantics.scores = ScoreMap(scores, classes, {});
+    view.semantics.share = share;
+    views.push_back(view);
+  }
+  FusionConfig config;
+  config.class_count = classes;
+  const SemanticProjector projector(config);
+  for (auto _ : state) {
+    benchmark::DoNotOptimize(projector.fuse(cloud, views, false).cloud.probabilities.data());
+  }
+  state.counters["points"] = static_cast<double>(cloud.size());
+}
+
+/// Projection and masks of the same cameras alone, of OpenCV's parts: cv::fisheye, the points
+/// sorted by distance, a rectangle for each that is seen. No transfer and no merging.
+void lidarPeer(benchmark::State& state) {
+  const Cloud& cloud = turnOf(state);
+  const auto cameras = static_cast<int>(state.range(2));
+  const CameraInfo info = lens();
+  const CameraModel model(info, {});
+  const MaskSize size =
+      paperMaskSize(model, 360.0 / static_cast<double>(state.range(1)) * kPi / 180.0,
+                    30.0 / static_cast<double>(state.range(0) - 1) * kPi / 180.0);
+  const cv::Point half((size.width - 1) / 2, (size.height - 1) / 2);
+  const cv::Rect image(0, 0, info.size.width, info.size.height);
+  for (auto _ : state) {
+    for (int c = 0; c < cameras; ++c) {
+      const Transform T = cameraFromLidar(360.0 / cameras * c);
+      std::vector<cv::Point3f> seen;
+      std::vector<std::pair<float, int>> order;
+      for (std::size_t i = 0; i < cloud.size(); ++i) {
+        const Eigen::Vector3d p = T * Eigen::Vector3d(cloud.x[i], cloud.y[i], cloud.z[i]);
+        if (p.z() <= 0.1) continue;
+        order.emplace_back(static_cast<float>(p.norm()), static_cast<int>(seen.size()));
+        seen.emplace_back(static_cast<float>(p.x()), static_cast<float>(p.y()),
+                          static_cast<float>(p.z()));
+      }
+      std::vector<cv::Point2f> pixels;
+      cv::fisheye::projectPoints(seen, pixels, cv::Vec3d(), cv::Vec3d(), cv::Matx33d(info.k.data()),
+                                 info.d);
+      std::sort(order.begin(), order.end());
+      cv::Mat mask = cv::Mat::zeros(info.size.height, info.size.width, CV_8UC1);
+      int visible = 0;
+      for (const auto& [distance, at] : order) {
+        const cv::Point pixel(pixelIndex(pixels[static_cast<std::size_t>(at)].x),
+                              pixelIndex(pixels[static_cast<std::size_t>(at)].y));
+        if (!image.contains(pixel) || mask.at<std::uint8_t>(pixel) != 0) continue;
+        ++visible;
+        cv::rectangle(mask, pixel - half, pixel + half, cv::Scalar(255), cv::FILLED);
+      }
+      benchmark::DoNotOptimize(visible);
+    }
+  }
+}
+
+/// 10 and 20 turns a second of lidars that fire as often; many cameras; many classes.
+void lidarArguments(benchmark::internal::Benchmark* rows) {
+  rows->Args({16, 1800, 5, 12});
+  for (const int rings : {64, 128}) {
+    for (const int steps : {2048, 1024}) rows->Args({rings, steps, 5, 12});
+  }
+  rows->Args({16, 1800, 16, 12});
+  rows->Unit(benchmark::kMicrosecond);
+}
+BENCHMARK(lidarOurs)->Name("lidar/ours")->Apply(lidarArguments)->Args({16, 1800, 5, 150});
+BENCHMARK(lidarPeer)->Name("lidar/cv::fisheye+cv::rectangle")->Apply(lidarArguments);
 
 }  // namespace
 }  // namespace semantic_lidar_fusion

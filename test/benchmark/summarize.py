@@ -75,6 +75,41 @@ PAIRS = [
         None,
         None,
     ),
+    *(
+        (
+            "share of %s" % name,
+            r"share/%s/%s" % (kind, arguments),
+            r"share/float/%s" % arguments,
+            "the same of float scores",
+            1.0,
+            2.5,
+        )
+        for name, kind, arguments in [
+            ("u8 scores, 640 wide", "u8", "640/12"),
+            ("u8 scores, 1920 wide", "u8", "1920/12"),
+            ("u8 scores, 240 wide, 150 classes", "u8", "240/150"),
+            ("u16 scores, 1920 wide", "u16", "1920/12"),
+        ]
+    ),
+    *(
+        (
+            "lidar part, " + name,
+            r"lidar/ours/%s" % arguments,
+            r"lidar/cv::fisheye.*/%s" % peer_arguments,
+            "cv::fisheye + cv::rectangle, without transfer",
+            None,
+            None,
+        )
+        for name, arguments, peer_arguments in [
+            ("16 rings, 10 Hz", "16/1800/5/12", "16/1800/5/12"),
+            ("64 rings, 10 Hz", "64/2048/5/12", "64/2048/5/12"),
+            ("64 rings, 20 Hz", "64/1024/5/12", "64/1024/5/12"),
+            ("128 rings, 10 Hz", "128/2048/5/12", "128/2048/5/12"),
+            ("128 rings, 20 Hz", "128/1024/5/12", "128/1024/5/12"),
+            ("16 rings, 16 cameras", "16/1800/16/12", "16/1800/16/12"),
+            ("16 rings, 150 classes", "16/1800/5/150", "16/1800/5/12"),
+        ]
+    ),
     (
         "voxel map",
         r"voxelMap/dirichlet:0",
