@@ -131,6 +131,13 @@ def make_parser():
         "the paper's at its 0.1 deg and at a VLP-16's 0.2 deg)",
     )
     parser.add_argument(
+        "--registration",
+        action="store_true",
+        help="instead of Table I: how thick flat surfaces are in ten scans laid over each other, and "
+        "how well a registration (small_gicp, if it is installed) follows the vehicle, without "
+        "motion correction, with that of packets and of firings, and without moving classes",
+    )
+    parser.add_argument(
         "--map",
         action="store_true",
         help="also score voxel maps of the clouds (see build_semantic_map.py), with the tf of IN.bag",
@@ -206,6 +213,7 @@ def check(parser, options):
             "fit_on",
             "live",
             "masks",
+            "registration",
             "map",
             "paper",
             "bounds",
@@ -215,8 +223,9 @@ def check(parser, options):
                 parser.error("--images and --%s exclude each other" % name.replace("_", "-"))
     elif not options.rig and not options.clouds:
         parser.error("give --rig, or --clouds of existing bags")
-    if options.masks and not options.rig:
-        parser.error("--masks needs --rig")
+    for name in ("masks", "registration"):
+        if getattr(options, name) and not options.rig:
+            parser.error("--%s needs --rig" % name)
     for name in ("paper", "bounds"):
         if getattr(options, name) and options.clouds:
             parser.error("--%s runs fuse_bag; it has no use for --clouds" % name)
@@ -224,8 +233,11 @@ def check(parser, options):
         single = name not in ("paper", "bounds")
         if single and getattr(options, name) and len(options.bags) > 1:
             parser.error("--%s is for one IN.bag" % name.replace("_", "-"))
-        if getattr(options, name) and options.masks and name != "truth":
-            parser.error("--masks and --%s exclude each other" % name.replace("_", "-"))
+        for alone in ("masks", "registration"):
+            if getattr(options, name) and getattr(options, alone) and name != "truth":
+                parser.error("--%s and --%s exclude each other" % (alone, name.replace("_", "-")))
+    if options.masks and options.registration:
+        parser.error("--masks and --registration exclude each other")
     if options.clouds and options.fit_temperature:
         parser.error("--fit-temperature runs fuse_bag; it has no use for --clouds")
     if options.fit_on and not options.fit_temperature:

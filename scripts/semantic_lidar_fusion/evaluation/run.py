@@ -2,12 +2,14 @@
 """From what evaluate.py is asked to its files."""
 
 import dataclasses
+import importlib
 import os
 import shutil
 import tempfile
 from dataclasses import dataclass
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
+from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.bags.bag_io import BagReader, write_text
 from semantic_lidar_fusion.errors import DataError
 from semantic_lidar_fusion.evaluation import html_report, image_truth, scoring, tables
@@ -144,6 +146,7 @@ class Options:
     compare: Tuple[str, ...] = ()
     min_edge_px: float = 0.0
     masks: bool = False
+    registration: bool = False
     fit_temperature: bool = False
     fit_on: Optional[str] = None
     map: bool = False
@@ -220,6 +223,8 @@ def evaluate(options: Options) -> str:
         results = Results()
         if options.images:
             title = _evaluate_images(options, results, workspace)
+        elif options.registration:
+            title = _evaluate_registration(options, results, workspace)
         elif options.masks:
             title = _evaluate_masks(options, results, workspace)
         else:
@@ -421,6 +426,25 @@ def _evaluate_masks(options: Options, results: Results, workspace: str) -> str:
                 raise DataError("%s: its points_truth has no field visible" % bag)
             compared.append((_name(bag), mask.name, rates))
     results.add_masks(compared)
+    return _title(options)
+
+
+def _evaluate_registration(options: Options, results: Results, workspace: str) -> str:
+    """Thickness of surfaces and error of a trajectory, with and without motion correction."""
+    from semantic_lidar_fusion.evaluation import registration
+
+    rig = Rig.load(options.rig or "", options.settings, options.fuse_bag)
+    fuser = Fuser(options, rig, workspace)
+    module: Any = None
+    try:
+        module = importlib.import_module("small_gicp")
+    except ImportError:
+        cli.warn("no error of a trajectory: small_gicp is not installed (pip install small_gicp)")
+    for bag in options.bags:
+        fused = fuser.fuse(bag, registration.CONFIGURATIONS)
+        judged = registration.evaluate(fused, rig.labels, bag, rig, module)
+        results.sections += ["## Registration of %s\n" % _name(bag), registration.section(judged)]
+        results.files["registration_%s.csv" % _name(bag)] = registration.csv(judged)
     return _title(options)
 
 
