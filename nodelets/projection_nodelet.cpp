@@ -136,15 +136,15 @@ class ProjectionNodelet : public FusionNodelet {
     } else if (!wanted && camera->selection) {
       unsubscribe(&camera->selection);
     }
-    const bool scores = config.input == CameraInput::kScores;
+    const bool scores = !transfersProbabilities(rig(), config);
     images(wanted && scores, semanticsTopic(rig(), config), &camera->scores,
            &ProjectionNodelet::onScores);
     images(wanted && scores, cameraTopic(config, "share"), &camera->share,
            &ProjectionNodelet::onShare);
-    // Labels become probabilities in the superpixel nodelet; probabilities come from another node.
+    // Made by the superpixel nodelet, unless another node gives them.
     images(wanted && !scores,
-           config.input == CameraInput::kLabels ? cameraTopic(config, "probabilities")
-                                                : semanticsTopic(rig(), config),
+           config.input == CameraInput::kProbabilities ? semanticsTopic(rig(), config)
+                                                       : cameraTopic(config, "probabilities"),
            &camera->probabilities, &ProjectionNodelet::onProbabilities);
     images(wanted && isWanted(camera->overlay), cameraTopic(config, "image_selected"),
            &camera->image, &ProjectionNodelet::onImage);

@@ -205,7 +205,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     segment(camera, **scores, &segmented);
     if (listened(camera->superpixels)) add(camera->superpixels, segmented.superpixels.ids);
     if (camera->config.input == CameraInput::kScores) add(camera->share, segmented.share);
-    if (camera->config.input == CameraInput::kLabels || listened(camera->probabilities)) {
+    if (transfersProbabilities(rig(), camera->config) || listened(camera->probabilities)) {
       add(camera->probabilities, pipeline_->probabilities(segmented));
     }
     if (listened(camera->overlay)) {

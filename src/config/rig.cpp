@@ -351,6 +351,7 @@ UncertaintyConfig readUncertainty(YamlSection section) {
   UncertaintyConfig uncertainty;
   section.number("temperature", &uncertainty.temperature, {0, 1e6, true});
   section.number("exponent", &uncertainty.exponent, {0, 100});
+  section.number("blend", &uncertainty.blend, {0, 1});
   section.finish();
   return uncertainty;
 }

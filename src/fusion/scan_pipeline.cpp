@@ -129,10 +129,18 @@ void ScanPipeline::segment(std::size_t index, SegmentedImage* image) {
         histogramProbabilities(image->superpixels, image->input, class_count);
     return;
   }
-  image->semantics.scores = ScoreMap(image->input, class_count, camera.score_format);
-  const ShareMap share = computeShare(image->superpixels, image->semantics.scores);
-  image->share = image->semantics.share = share.share;
+  const ScoreMap scores(image->input, class_count, camera.score_format);
+  const ShareMap share = computeShare(image->superpixels, scores);
+  image->share = share.share;
   image->nonfinite_cells = share.nonfinite_cells;
+  if (transfersProbabilities(rig_, camera)) {
+    const cv::Mat blended = blendScores(image->superpixels, scores, rig_.uncertainty.blend);
+    image->semantics.probabilities =
+        denseProbabilities(ScoreMap(blended, class_count, {}), share.share, rig_.uncertainty);
+  } else {
+    image->semantics.scores = scores;
+    image->semantics.share = share.share;
+  }
 }
 
 void ScanPipeline::cluster(std::size_t index, SegmentedImage* image) {
@@ -147,7 +155,7 @@ void ScanPipeline::cluster(std::size_t index, SegmentedImage* image) {
 }
 
 cv::Mat ScanPipeline::probabilities(const SegmentedImage& image) const {
-  return image.share.empty()
+  return image.semantics.scores.empty()
              ? image.semantics.probabilities
              : denseProbabilities(image.semantics.scores, image.share, rig_.uncertainty);
 }
@@ -221,6 +229,10 @@ FusionResult ScanPipeline::fuse(const Cloud& cloud, std::vector<CameraView> view
 }
 
 // --- Selection
+
+bool transfersProbabilities(const Rig& rig, const CameraConfig& camera) {
+  return camera.input != CameraInput::kScores || rig.uncertainty.blend > 0.0;
+}
 
 bool isCandidate(CameraInput input, const ImageParts& parts, bool made_on_request) {
   const bool needs_pixels = made_on_request || input != CameraInput::kProbabilities;

@@ -37,6 +37,8 @@ void checkConfig(const FusionConfig& config) {
   require(std::isfinite(temperature) && temperature > 0, "uncertainty.temperature", temperature,
           "finite and above 0");
   nonNegative("uncertainty.exponent", config.uncertainty.exponent);
+  const double blend = config.uncertainty.blend;
+  require(blend >= 0.0 && blend <= 1.0, "uncertainty.blend", blend, "in 0..1");
   nonNegative("occlusion.vertical_step_deg", config.occlusion.vertical_step_deg);
   nonNegative("occlusion.horizontal_step_deg", config.occlusion.horizontal_step_deg);
   nonNegative("occlusion.depth_margin_m", config.occlusion.depth_margin_m);

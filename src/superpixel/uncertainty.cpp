@@ -293,6 +293,46 @@ cv::Mat denseProbabilities(const ScoreMap& scores, const cv::Mat& share,
   return result;
 }
 
+cv::Mat blendScores(const SuperpixelMap& superpixels, const ScoreMap& scores, double blend) {
+  if (scores.empty()) throw DataError("score map is empty, must have at least one cell");
+  const cv::Mat& ids = superpixels.ids;
+  const auto class_count = static_cast<std::size_t>(scores.classCount());
+  const std::vector<int> columns = cellsUnderCentres(ids.cols, scores.size().width);
+  const std::vector<int> rows = cellsUnderCentres(ids.rows, scores.size().height);
+  std::vector<double> mean(superpixels.count * class_count);
+  std::vector<int> totals(superpixels.count);
+  std::vector<std::uint8_t> finite(ids.total());
+  cv::Mat result(ids.size(), CV_32FC(scores.classCount()));
+  for (int y = 0; y < ids.rows; ++y) {
+    float* cell = result.ptr<float>(y);
+    std::uint8_t* is_finite = &finite[static_cast<std::size_t>(y) * ids.cols];
+    const bool clustered = y >= superpixels.firstRow() && y < superpixels.endRow();
+    for (int x = 0; x < ids.cols; ++x, cell += class_count) {
+      is_finite[x] = scores.read(columns[x], rows[y], cell);
+      if (!is_finite[x] || !clustered) continue;
+      const int id = ids.at<int>(y, x);
+      ++totals[id];
+      for (std::size_t c = 0; c < class_count; ++c) mean[id * class_count + c] += cell[c];
+    }
+  }
+  for (int id = 0; id < superpixels.count; ++id) {
+    for (std::size_t c = 0; c < class_count; ++c) {
+      mean[id * class_count + c] *= blend / std::max(1, totals[id]);
+    }
+  }
+  for (int y = 0; y < ids.rows; ++y) {
+    float* cell = result.ptr<float>(y);
+    for (int x = 0; x < ids.cols; ++x, cell += class_count) {
+      if (!finite[static_cast<std::size_t>(y) * ids.cols + x]) continue;
+      const double* add = &mean[ids.at<int>(y, x) * class_count];
+      for (std::size_t c = 0; c < class_count; ++c) {
+        cell[c] = static_cast<float>((1.0 - blend) * cell[c] + add[c]);
+      }
+    }
+  }
+  return result;
+}
+
 cv::Mat histogramProbabilities(const SuperpixelMap& superpixels, const cv::Mat& labels,
                                int class_count) {
   checkClassCount(class_count);

@@ -19,10 +19,10 @@ def drive(**changes):
 
 
 class Inputs(live.ReplayCase):
-    def replay(self, a_drive):
+    def replay(self, a_drive, *settings):
         with live.folder() as path:
             made = live.Made(path, a_drive)
-            overrides = live.patience() + FREE_RUNNING
+            overrides = live.patience() + FREE_RUNNING + list(settings)
             expected = made.fused(*overrides)
             return self.assert_replay_gives(expected, made.bag, made.rig, overrides, made.topics())
 
@@ -43,8 +43,8 @@ class Inputs(live.ReplayCase):
     def test_png(self):
         self.replay(drive(image_transport="compressed"))
 
-    def test_jpeg(self):
-        self.replay(drive(image_transport="jpeg"))
+    def test_jpeg_and_scores_blended_with_their_superpixels(self):
+        self.replay(drive(image_transport="jpeg"), "uncertainty.blend=0.4")
 
 
 if __name__ == "__main__":

@@ -108,6 +108,10 @@ class ScanPipeline {
 
 FusionConfig fusionConfig(const Rig& rig);
 
+/// Whether the points of a camera take the probabilities of whole images, and not scores that are
+/// tempered where a point reads them: no scores come, or their superpixels' means are blended in.
+bool transfersProbabilities(const Rig& rig, const CameraConfig& camera);
+
 /// What has come of one image.
 struct ImageParts {
   bool pixels = false;

@@ -20,6 +20,7 @@ namespace semantic_lidar_fusion {
 struct UncertaintyConfig {
   double temperature = 1.0;  ///< of a pure superpixel, > 0; the paper's is 1
   double exponent = 2.0;     ///< of the share, >= 0; the paper's is 2, 0 ignores the share
+  double blend = 0.0;  ///< part of the superpixel's mean in the scores, 0..1; the paper's is 0
 };
 
 /// How integer score images become scores: S = scale * value + offset. Float scores ignore it.
@@ -87,6 +88,11 @@ bool temperedSoftmax(const float* scores, int class_count, double share,
 /// pixel.
 cv::Mat denseProbabilities(const ScoreMap& scores, const cv::Mat& share,
                            const UncertaintyConfig& config);
+
+/// Scores averaged with their superpixel's mean: (1 - blend) S + blend mean, CV_32FC(n) of the
+/// superpixel map's size. The mean is over the superpixel's clustered pixels with finite scores; a
+/// pixel without keeps what its cell holds. `blend` in 0..1. Throws DataError on an empty map.
+cv::Mat blendScores(const SuperpixelMap& superpixels, const ScoreMap& scores, double blend);
 
 /// Label-only input: P = histogram of the labels within the pixel's superpixel,
 /// CV_32FC(class_count) of the superpixel map's size. `labels`: CV_8UC1, any size; ids >=

@@ -61,6 +61,7 @@ TEST(RigTest, EmptyRigHasTheDefaultsOfTheStructs) {
   EXPECT_EQ(rig.superpixels.iterations, 10);
   EXPECT_EQ(rig.uncertainty.temperature, 1.0);
   EXPECT_EQ(rig.uncertainty.exponent, 2.0);
+  EXPECT_EQ(rig.uncertainty.blend, 0.0);
   EXPECT_EQ(rig.odometry.lookup, OdometryLookup::kInterpolate);
   EXPECT_EQ(rig.odometry.on_missing, OnMissingOdometry::kMark);
   EXPECT_EQ(rig.motion_granularity, MotionGranularity::kFiring);
@@ -112,7 +113,7 @@ lidar: {input: points, topic: /ouster/points, model: VLP-32C, frame: /os, min_ra
 fixed_frame: /map
 vehicle_frame: chassis
 superpixels: {count: 500, compactness: 2.5, iterations: 4, scale: 0.5, warm_start: false}
-uncertainty: {temperature: 1.5, exponent: 0}
+uncertainty: {temperature: 1.5, exponent: 0, blend: 0.25}
 motion: {enabled: false, granularity: packet}
 odometry: {source: topic, topic: /odo, time_offset: 0.01, lookup: closest, on_missing: extrapolate,
            max_extrapolation: 0.05, timeout: 0.3, fastest_mps: 30, largest_coordinate_m: 1e7}
@@ -171,6 +172,7 @@ threads: 3
   EXPECT_FALSE(rig.superpixels.warm_start);
   EXPECT_EQ(rig.uncertainty.temperature, 1.5);
   EXPECT_EQ(rig.uncertainty.exponent, 0);
+  EXPECT_EQ(rig.uncertainty.blend, 0.25);
   EXPECT_FALSE(rig.motion_enabled);
   EXPECT_EQ(rig.motion_granularity, MotionGranularity::kPacket);
   EXPECT_EQ(rig.odometry.source, OdometrySource::kTopic);
@@ -308,6 +310,7 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
             "rig.yaml: uncertainty.temperature = 0: must be a "
             "number above 0"},
            {"uncertainty: {exponent: -2}", "rig.yaml: uncertainty.exponent = -2: must be"},
+           {"uncertainty: {blend: 1.5}", "rig.yaml: uncertainty.blend = 1.5: must be"},
            {"motion: {granularity: point}",
             "rig.yaml: motion.granularity = point: must be one of "
             "firing, packet"},

@@ -565,6 +565,49 @@ TEST(HistogramProbabilities, RefusesWhatIsNoLabelImage) {
   EXPECT_THROW(histogramProbabilities(map, cv::Mat(1, 1, CV_8UC1, cv::Scalar(0)), 513), DataError);
 }
 
+TEST(BlendScores, AveragesEachPixelWithItsSuperpixel) {
+  const int class_count = 5;
+  const SuperpixelMap map = blockMap(37, 29, 6);
+  cv::Mat scores = randomScores(20, 33, class_count, 8);
+  scores.ptr<float>(7)[4 * class_count + 1] = kInfinity;
+  const ScoreMap score_map(scores, class_count, {});
+  const auto cellAt = [&](int x, int y, float* cell) {
+    return score_map.read(cellUnderCentre(x, 37, 20), cellUnderCentre(y, 29, 33), cell);
+  };
+  std::vector<std::vector<long double>> sums(map.count, std::vector<long double>(class_count));
+  std::vector<int> voters(map.count);
+  std::vector<float> cell(class_count);
+  for (int y = 0; y < 29; ++y) {
+    for (int x = 0; x < 37; ++x) {
+      if (!cellAt(x, y, cell.data())) continue;
+      const int id = map.ids.at<int>(y, x);
+      ++voters[id];
+      for (int c = 0; c < class_count; ++c) sums[id][c] += cell[c];
+    }
+  }
+  for (const double blend : {0.0, 0.27, 1.0}) {
+    const cv::Mat blended = blendScores(map, score_map, blend);
+    ASSERT_EQ(blended.type(), CV_32FC(class_count));
+    for (int y = 0; y < 29; ++y) {
+      for (int x = 0; x < 37; ++x) {
+        const bool finite = cellAt(x, y, cell.data());
+        const int id = map.ids.at<int>(y, x);
+        for (int c = 0; c < class_count; ++c) {
+          const float ours = blended.ptr<float>(y)[x * class_count + c];
+          if (!finite) {
+            ASSERT_EQ(ours, cell[c]);
+            continue;
+          }
+          const auto mean = static_cast<double>(sums[id][c] / voters[id]);
+          ASSERT_NEAR(ours, (1.0 - blend) * cell[c] + blend * mean,
+                      2 * kFloatStep * (std::abs(cell[c]) + std::abs(mean)));
+        }
+      }
+    }
+  }
+  EXPECT_THROW(blendScores(map, ScoreMap(), 0.5), DataError);
+}
+
 TEST(DenseProbabilities, RefuseAnotherTypeOfShare) {
   const ScoreMap scores(randomScores(2, 2, 3, 1), 3, {});
   EXPECT_THROW(denseProbabilities(scores, cv::Mat(), {}), DataError);
