@@ -61,6 +61,7 @@ def main():
     parser.add_argument("--scans", type=int, default=300)
     parser.add_argument("--rate", type=float, default=10.0, help="scans a second (default: 10)")
     parser.add_argument("--speed", type=float, default=10.0, help="m/s (default: 10)")
+    parser.add_argument("--rays", type=float, default=45.0, help="~ray_range_m, m (default: 45)")
     parser.add_argument("--port", type=int, default=11897, help="of the master")
     options = parser.parse_args()
     os.environ["ROS_MASTER_URI"] = "http://127.0.0.1:%d" % options.port
@@ -74,7 +75,9 @@ def main():
     script = os.path.join(SOURCE_DIR, "scripts", "semantic_map_node.py")
     master = subprocess.Popen(["rosmaster", "--core", "-p", str(options.port)])
     time.sleep(2.0)
-    node = subprocess.Popen(["/usr/bin/python3", script, "_tf_timeout_s:=5.0"])
+    node = subprocess.Popen(
+        ["/usr/bin/python3", script, "_tf_timeout_s:=5.0", "_ray_range_m:=%g" % options.rays]
+    )
     try:
         rospy.init_node("load", disable_signals=True)
         labels = LabelSet.from_file(package_file("config/classes_usyd12.yaml"))
