@@ -20,6 +20,23 @@
 namespace semantic_lidar_fusion {
 namespace {
 
+// Where a message stands is known to rosbag alone; an explicit instantiation may name what is
+// private.
+template <typename Tag, typename Tag::Member kMember>
+struct Named {
+  friend typename Tag::Member member(Tag) { return kMember; }
+};
+struct PlaceOfMessage {
+  using Member = const rosbag::IndexEntry rosbag::MessageInstance::*;
+  friend Member member(PlaceOfMessage);
+};
+struct BagOfMessage {
+  using Member = const rosbag::Bag* rosbag::MessageInstance::*;
+  friend Member member(BagOfMessage);
+};
+template struct Named<PlaceOfMessage, &rosbag::MessageInstance::index_entry_>;
+template struct Named<BagOfMessage, &rosbag::MessageInstance::bag_>;
+
 using Handler = std::function<void(const rosbag::MessageInstance&)>;
 
 /// The topic as the bag has it; empty (and `problem` filled) if it is absent or of another type.
@@ -319,18 +336,50 @@ void DriveReader::guarded(const rosbag::MessageInstance& message,
   }
 }
 
-bool DriveReader::readOne() {
-  if (!next_) {
-    next_ = view_.begin();
-  } else {
-    ++*next_;
+/// Finds the messages of a short time. They are read in their order in the file, so that each chunk
+/// is decompressed once also where record times of a chunk reach into the next one: unless that is
+/// not the order of time within a topic.
+void DriveReader::findTogether() {
+  constexpr double kTogetherS = 0.1;
+  if (!next_) next_ = view_.begin();
+  if (*next_ == view_.end()) return;
+  time_ = together_until_ = (*next_)->getTime();
+  std::vector<const rosbag::Bag*> bags;  // in the order of the view, which depends on no address
+  std::map<std::string, PlaceInBags> last;
+  std::vector<rosbag::MessageInstance> messages;
+  bool is_orderly = true;
+  for (; *next_ != view_.end(); ++*next_) {
+    const rosbag::MessageInstance& message = **next_;
+    if (message.getTime().toSec() > time_.toSec() + kTogetherS) break;
+    together_until_ = message.getTime();
+    const rosbag::Bag* bag = message.*member(BagOfMessage());
+    const auto known = std::find(bags.begin(), bags.end(), bag);
+    const auto number = static_cast<std::size_t>(known - bags.begin());
+    if (known == bags.end()) bags.push_back(bag);
+    const rosbag::IndexEntry& entry = message.*member(PlaceOfMessage());
+    const PlaceInBags place(number, entry.chunk_pos, entry.offset);
+    const auto [topic, is_first] = last.emplace(message.getTopic(), place);
+    is_orderly = is_orderly && (is_first || topic->second < place);
+    topic->second = place;
+    together_.emplace(place, message);
+    messages.push_back(message);
   }
-  if (*next_ == view_.end()) return false;
-  const rosbag::MessageInstance& message = **next_;
-  time_ = message.getTime();
+  if (is_orderly) return;
+  together_.clear();
+  for (std::size_t i = 0; i < messages.size(); ++i) {
+    together_.emplace(PlaceInBags(i, 0, 0), messages[i]);
+  }
+}
+
+bool DriveReader::readOne() {
+  if (together_.empty()) findTogether();
+  if (together_.empty()) return false;
+  const auto next = together_.extract(together_.begin());
+  const rosbag::MessageInstance& message = next.mapped();
   for (const Handler& handle : router_->handlers().at(bareTopic(message.getTopic()))) {
     guarded(message, handle);
   }
+  if (together_.empty()) time_ = together_until_;
   return true;
 }
 

@@ -15,6 +15,7 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -82,7 +83,7 @@ class DriveReader {
 
   /// Reads one message; false if there is no other.
   bool readOne();
-  /// When the last one was recorded.
+  /// All that was recorded before is read.
   ros::Time time() const { return time_; }
   /// Keeps no image any more that was recorded more than `seconds` before `time`.
   void release(const ros::Time& time, double seconds);
@@ -109,6 +110,7 @@ class DriveReader {
   template <typename Message>
   void addImage(const rosbag::MessageInstance& message, const std::string& what,
                 ImagesByStamp* images, boost::shared_ptr<const Message> StoredImage::*kept);
+  void findTogether();
   void keep(StoredImage* image, std::size_t bytes);
   void dropOldest();
 
@@ -124,6 +126,10 @@ class DriveReader {
   std::unique_ptr<Router> router_;
   rosbag::View view_;
   std::optional<rosbag::View::iterator> next_;
+  /// Messages that are read together, by bag and place in it.
+  using PlaceInBags = std::tuple<std::size_t, std::uint64_t, std::uint32_t>;
+  std::map<PlaceInBags, rosbag::MessageInstance> together_;
+  ros::Time together_until_;  ///< record time of the last of them
   ros::Time time_;
   std::uint64_t scan_count_ = 0;
   std::deque<Kept> kept_;  ///< in the order in which they were read
