@@ -288,7 +288,7 @@ void FusionRun::writeScan(const ScanTask& task) {
                  name + ", image " + std::to_string(image->stamp) + " ns: " + image->failure);
   }
   for (std::size_t i = 0; i < outputs_.size(); ++i) {
-    outputs_[i].write(task, task.outputs[i], images_.pipeline());
+    outputs_[i].write(task, task.outputs[i]);
   }
   progress_.update(++written_);
   const std::lock_guard<std::mutex> lock(mutex_);
@@ -340,10 +340,11 @@ namespace {
 /// What of a rig says how the bag is read and its images are made: all but what comes after.
 std::string readingOf(const Rig& rig) {
   YAML::Node root = YAML::Load(rig.yaml);
-  for (const char* key : {"motion", "occlusion", "overlap", "smoothing", "uncertainty",
-                          "keep_unlabelled", "threads"}) {
+  for (const char* key :
+       {"motion", "occlusion", "overlap", "smoothing", "keep_unlabelled", "threads"}) {
     root.remove(key);
   }
+  if (!(rig.uncertainty.blend > 0.0)) root.remove("uncertainty");  // else images hold its result
   for (const char* key : {"lookup", "on_missing", "max_extrapolation"}) {
     root["odometry"].remove(key);
   }

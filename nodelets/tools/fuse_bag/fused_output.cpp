@@ -103,12 +103,11 @@ void FusedOutput::fuse(const ScanTask& task, OutputTask* result) const {
   }
 }
 
-void FusedOutput::write(const ScanTask& task, const OutputTask& result,
-                        const ScanPipeline& images) {
+void FusedOutput::write(const ScanTask& task, const OutputTask& result) {
   for (const auto& image : task.new_images) {
     if (!hasImage(image)) continue;
     if (!image->image->note.empty() && !quiet_) DropLog::note(image->image->note);
-    if (all_) writer_.writeImage(*image, images);
+    if (all_) writer_.writeImage(*image, pipeline_);
   }
   try {
     if (!result.failure.empty()) throw DataError(result.failure);

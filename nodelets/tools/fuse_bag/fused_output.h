@@ -65,8 +65,8 @@ class FusedOutput {
                   const std::vector<ros::Time>& info_times, const VisibilityTruth* truth) const;
   /// Occlusion, transfer and merging, once the images are made. May run in several threads.
   void fuse(const ScanTask& task, OutputTask* result) const;
-  /// Writes a fused scan, in the order of the bag. `images` knows the new images' probabilities.
-  void write(const ScanTask& task, const OutputTask& result, const ScanPipeline& images);
+  /// Writes a fused scan, in the order of the bag.
+  void write(const ScanTask& task, const OutputTask& result);
 
   void copyTransforms(const std::vector<rosbag::MessageInstance>& transforms) {
     writer_.copyTransforms(transforms);
