@@ -132,6 +132,7 @@ class ImageSelectionNodelet : public FusionNodelet {
   void onImage(int index, const Image& image, StampNs stamp) {
     Camera& camera = *cameras_[static_cast<std::size_t>(index)];
     if (!isStamped(imageTopic(camera.config), stamp)) return;
+    lookAtArrival(imageTopic(camera.config), stamp);
     admit(epochs_.get(), imageTopic(camera.config), trueImageTime(camera, stamp),
           [this, index, image, stamp, &camera] {
             camera.images.put(stamp, image);
@@ -173,6 +174,7 @@ class ImageSelectionNodelet : public FusionNodelet {
       }
       scan.interval = scanInterval(cloud);
       if (!isStamped(rig().lidar.topic, scan.interval.first_ns)) return;
+      lookAtArrival(rig().lidar.topic, cloud.header_stamp);
       if (sweep_) scan.sweep_ns = sweepTimes(cloud);
     }
     admit(epochs_.get(), rig().lidar.topic, scan.interval.first_ns, [this, scan] {

@@ -90,6 +90,7 @@ class MotionCompensationNodelet : public FusionNodelet {
       scan->cloud = lidar_->decode(*message);
     }
     reportNotes();
+    rigWatch().lookAtScan(scan->cloud);
     scan->interval = scanInterval(scan->cloud);
     if (scan->interval.first_ns <= 0) {  // the selection nodelet says it; it is no jump of time
       health().count("dropped: scan of stamp 0");
@@ -208,6 +209,9 @@ class MotionCompensationNodelet : public FusionNodelet {
 
   void publishCompensated(TimedCloud scan, StampNs t_ref,
                           const std::optional<Transform>& T_vehicle_lidar) {
+    if (T_vehicle_lidar && rig().motion_enabled) {
+      rigWatch().lookAtMotion(scan, tf_->source().odometry(), *T_vehicle_lidar);
+    }
     CompensationResult compensated;
     {
       const StageTimer timer(health(), "compensation");

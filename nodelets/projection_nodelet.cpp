@@ -4,6 +4,7 @@
 /// Scans wait in a FusionQueue until each camera is ready, has no image, or is late. All callbacks
 /// run one at a time.
 #include <algorithm>
+#include <cstdio>
 #include <memory>
 #include <optional>
 #include <pluginlib/class_list_macros.hpp>
@@ -32,6 +33,12 @@ namespace {
 constexpr std::size_t kKeptImages = 24;
 /// The same by size: nine times 960x604x12 floats.
 constexpr std::size_t kMaxSemanticsBytes = 256u << 20;
+
+std::string fixed(double value) {
+  char text[32];
+  std::snprintf(text, sizeof(text), "%.3f", value);
+  return text;
+}
 
 }  // namespace
 
@@ -90,7 +97,11 @@ class ProjectionNodelet : public FusionNodelet {
       // Camera_info is read from the start: it may be latched, or come only once.
       camera.info = subscribe<sensor_msgs::CameraInfo>(
           getNodeHandle(), inputTopic(camera.config, camera.config.camera_info), 8,
-          [&camera](const sensor_msgs::CameraInfoConstPtr& info) { camera.geometry.update(*info); },
+          [this, &camera](const sensor_msgs::CameraInfoConstPtr& info) {
+            camera.geometry.update(*info);
+            rigWatch().lookAtInfo(static_cast<std::size_t>(camera.index), *camera.geometry.info(),
+                                  *camera.geometry.model());
+          },
           Health::Expect::kOnce);
       if (camera.config.withoutCameraInfo()) health().retireInput(camera.info.getTopic());
     }
@@ -146,8 +157,8 @@ class ProjectionNodelet : public FusionNodelet {
            config.input == CameraInput::kProbabilities ? semanticsTopic(rig(), config)
                                                        : cameraTopic(config, "probabilities"),
            &camera->probabilities, &ProjectionNodelet::onProbabilities);
-    images(wanted && isWanted(camera->overlay), cameraTopic(config, "image_selected"),
-           &camera->image, &ProjectionNodelet::onImage);
+    images(wanted && (isWanted(camera->overlay) || rig().check.live),
+           cameraTopic(config, "image_selected"), &camera->image, &ProjectionNodelet::onImage);
   }
 
   // --- Inputs
@@ -222,6 +233,11 @@ class ProjectionNodelet : public FusionNodelet {
   }
 
   void onImage(Camera* camera, const sensor_msgs::ImageConstPtr& message) {
+    // Images are large: for the check they are kept only while one is due.
+    if (camera->overlay.getNumSubscribers() == 0 && !rigWatch().edgesAreDue()) {
+      camera->images.clear();
+      return;
+    }
     camera->images.put(stampNs(message->header.stamp), message);
   }
 
@@ -280,13 +296,14 @@ class ProjectionNodelet : public FusionNodelet {
     const bool drawn = std::any_of(cameras_.begin(), cameras_.end(), [](const auto& camera) {
       return camera->overlay.getNumSubscribers() > 0;
     });
-    const FusionResult result = pipeline_->fuse(cloud, std::move(views), drawn);
+    const FusionResult result = pipeline_->fuse(cloud, views, drawn);
     if (!result.note.empty() && result.note != told_note_) {
       told_note_ = result.note;
       health().set("lidar", result.note);
       NODELET_WARN_STREAM(result.note);
     }
     countPoints(result.cloud);
+    watchScan(scan, views, T_vehicle_lidar.transform, result.cloud);
     publish(output_, semanticCloudMessage(result.cloud, rig().classes));
     if (drawn) publishOverlays(scan, result);
     dropPassed(scan);
@@ -354,6 +371,33 @@ class ProjectionNodelet : public FusionNodelet {
       health().count(std::string("points ") + kPointStatusNames[status], counts[status]);
     }
     health().count("scans");
+  }
+
+  /// Shows the watch what a scan came to, and each camera's figures to those who look.
+  void watchScan(const CompletedScan& scan, const std::vector<CameraView>& views,
+                 const std::optional<Transform>& T_vehicle_lidar, const SemanticCloud& cloud) {
+    rigWatch().lookAtFusion(cloud, views, T_vehicle_lidar);
+    if (rig().check.live && rigWatch().edgesAreDue()) {
+      const StageTimer timer(health(), "check");
+      std::vector<cv::Mat> pixels;
+      for (const auto& camera : cameras_) {
+        const auto index = static_cast<std::size_t>(camera->index);
+        const auto* image = camera->images.find(scan.views[index].image_stamp);
+        pixels.push_back(image ? colorImage(*image) : cv::Mat());
+      }
+      rigWatch().lookAtEdges(lidarEdges(*scan.cloud), views, pixels);
+    }
+    for (const auto& camera : cameras_) {
+      const auto figures = rigWatch().figures(static_cast<std::size_t>(camera->index));
+      health().set(camera->config.name + ": points", std::to_string(figures.points));
+      health().set(camera->config.name + ": share of fused points",
+                   fixed(figures.fused_points > 0 ? static_cast<double>(figures.points) /
+                                                        static_cast<double>(figures.fused_points)
+                                                  : 0.0));
+      if (figures.edges.edges > 0) {
+        health().set(camera->config.name + ": edges meet with", fixed(figures.edges.lift()));
+      }
+    }
   }
 
   void publishOverlays(const CompletedScan& scan, const FusionResult& result) {

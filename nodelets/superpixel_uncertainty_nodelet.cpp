@@ -232,6 +232,8 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
   void segment(Camera* camera, const sensor_msgs::Image& scores, SegmentedImage* image) {
     try {
       image->input = pixelView(scores);
+      rigWatch().lookAtSemantics(camera->index, image->input,
+                                 {image->image.cols, image->image.rows});
       const StageTimer timer(health(),
                              camera->config.input == CameraInput::kLabels ? "histogram" : "share");
       pipeline_->segment(camera->index, image);

@@ -65,6 +65,7 @@ void FusionNodelet::onInit() {
       NODELET_WARN_STREAM(problem);
     }
     rig_ = loadRigFromParameters(getPrivateNodeHandle());
+    rig_watch_ = std::make_unique<RigWatch>(rig_);
     publishConfiguration();
     {
       // Listeners may connect while publishers are still being set up.
@@ -127,7 +128,21 @@ void FusionNodelet::demandChanged() {
   master_->run(update, Demand::kLinger);
 }
 
+void FusionNodelet::lookAtArrival(const std::string& topic, StampNs stamp) {
+  if (ros::Time::isSimTime()) return;
+  rig_watch_->lookAtArrival(topic, stamp, static_cast<StampNs>(ros::Time::now().toNSec()));
+}
+
+void FusionNodelet::tellDoubts() {
+  for (const RigDoubt& doubt : rig_watch_->takeDoubts()) {
+    health_.doubt(doubt.subject, doubt.text);
+    NODELET_WARN_STREAM(plainText(
+        "check: " + doubt.subject + ": " + doubt.text + "; " + kCheckCommand, kLongestLine));
+  }
+}
+
 void FusionNodelet::watch() {
+  tellDoubts();
   diagnostics_->force_update();
   SilenceWatchdog::Surroundings surroundings;
   surroundings.clock_is_silent = clockIsSilent();

@@ -24,6 +24,7 @@
 #include "base/report_throttle.h"
 #include "base/silence_watchdog.h"
 #include "base/topic_connections.h"
+#include "semantic_lidar_fusion/check/rig_watch.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
@@ -51,6 +52,11 @@ class FusionNodelet : public nodelet::Nodelet {
 
   const Rig& rig() const { return rig_; }
   Health& health() { return health_; }
+  /// Shown what passes through. What it doubts is told once in the log, and in the diagnostics from
+  /// then on.
+  RigWatch& rigWatch() { return *rig_watch_; }
+  /// Shows the watch that a message arrives, unless time is simulated: it is no time of arrival.
+  void lookAtArrival(const std::string& topic, StampNs stamp);
   std::mutex& connectMutex() { return connect_mutex_; }
 
   /// The clock of deadlines; see DeadlineClock.
@@ -119,12 +125,14 @@ class FusionNodelet : public nodelet::Nodelet {
   void publishConfiguration();
   void startDiagnostics();
   void watch();
+  void tellDoubts();
   void reportOverflow(const std::string& topic);
 
   /// A callback that runs while the nodelet is unloaded holds it until it returns, and the manager
   /// has destroyed the queues by then, into which timers and publishers reach as they end.
   std::shared_ptr<void> kept_queues_[2];
   Rig rig_;
+  std::unique_ptr<RigWatch> rig_watch_;
   Health health_;
   TopicConnections connections_;
   std::shared_ptr<MasterThread> master_ = MasterThread::shared();

@@ -73,6 +73,11 @@ void Health::set(const std::string& key, const std::string& value) {
   values_[key] = plainText(value, kLongestText);
 }
 
+void Health::doubt(const std::string& subject, const std::string& text) {
+  std::lock_guard<std::mutex> lock(mutex_);
+  doubts_.emplace_back(plainText(subject, kLongestText), plainText(text, kLongestText));
+}
+
 void Health::error(const std::string& text) {
   std::lock_guard<std::mutex> lock(mutex_);
   last_error_ = plainText(text, kLongestText);
@@ -139,6 +144,10 @@ void Health::fill(diagnostic_updater::DiagnosticStatusWrapper& status) {
     event.at_last_fill = event.total;
   }
   for (const auto& [key, value] : values_) status.add(key, value);
+  for (const auto& [subject, text] : doubts_) {
+    status.add("check " + subject, text);
+    status.mergeSummary(DiagnosticStatus::WARN, "check " + subject);
+  }
   if (!last_error_.empty()) {
     status.add("last error", last_error_);
     if (now - last_error_time_ < kErrorHold) {

@@ -9,6 +9,7 @@
 #include <map>
 #include <mutex>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "semantic_lidar_fusion/common/types.h"
@@ -38,6 +39,8 @@ class Health {
   void stage(const std::string& name, double milliseconds);
   /// A value to show as it is (queue length, age, image size).
   void set(const std::string& key, const std::string& value);
+  /// Something that looks wrong until somebody mends it: shown, and the level is WARN for good.
+  void doubt(const std::string& subject, const std::string& text);
   /// The last error; the level is ERROR for `kErrorHold` after it.
   void error(const std::string& text);
 
@@ -75,6 +78,7 @@ class Health {
   std::map<std::string, Event> events_;
   std::map<std::string, Stage> stages_;
   std::map<std::string, std::string> values_;
+  std::vector<std::pair<std::string, std::string>> doubts_;
   std::string last_error_;
   Clock::time_point last_error_time_{};
   Clock::time_point last_fill_ = Clock::now();

@@ -32,6 +32,8 @@ class CameraGeometry {
   }
 
   const std::shared_ptr<const CameraModel>& model() const { return model_; }
+  /// The last camera_info; empty until one came.
+  const std::optional<CameraInfo>& info() const { return info_; }
   /// Empty until a camera_info came, unless the rig names it.
   std::string frame() const { return frame_.empty() && info_ ? info_->frame_id : frame_; }
 

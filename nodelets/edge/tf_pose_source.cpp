@@ -233,12 +233,14 @@ bool TfPoseSource::add(const nav_msgs::Odometry& message) {
   problem_.clear();
   const std::string name = "odometry of " + frameName(message.child_frame_id);
   if (message.header.stamp.isZero()) return refuse("odometry", name, "its stamp is 0");
+  Transform T_fixed_body;
   try {
-    checkPlace(transform(message.pose.pose).translation(), config_.largest_coordinate_m);
+    T_fixed_body = transform(message.pose.pose);
+    checkPlace(T_fixed_body.translation(), config_.largest_coordinate_m);
   } catch (const DataError& e) {
     return refuse("odometry", name, e.what());
   }
-  noteTwist(message);
+  noteTwist(message, T_fixed_body);
   pending_.push_back(message);
   if (pending_.size() > kMaxPendingOdometry) pending_.pop_front();
   counters_.odometry_pending = pending_.size();
@@ -250,36 +252,14 @@ bool TfPoseSource::isOdometry(const geometry_msgs::TransformStamped& message) {
                                         frameName(message.child_frame_id)) != moving_.end();
 }
 
-/// Compares how far the poses and the twists of the messages go, second by second: a pose that is
-/// frozen, or of another unit or vehicle than the twist.
-void TfPoseSource::noteTwist(const nav_msgs::Odometry& message) {
-  const StampNs stamp = stampNs(message.header.stamp);
-  const auto& v = message.twist.twist.linear;
-  const double speed_mps = std::sqrt(v.x * v.x + v.y * v.y + v.z * v.z);
-  const auto& p = message.pose.pose.position;
-  const Eigen::Vector3d at(p.x, p.y, p.z);
-  auto& way = travelled_;
-  const bool joined = stamp > way.end && stamp - way.end < kNsPerSecond / 2;
-  if (!joined || !std::isfinite(speed_mps)) {
-    way = {stamp, stamp, at, 0.0};
-    return;
-  }
-  way.by_twist_m += speed_mps * toSeconds(stamp - way.end);
-  way.end = stamp;
-  if (way.end - way.begin < kNsPerSecond) return;
-  const double by_pose_m = (at - way.from).norm();
-  // Drivers without a twist leave it 0.
-  if (way.by_twist_m > 1.0 &&
-      (by_pose_m < 0.5 * way.by_twist_m || by_pose_m > 2.0 * way.by_twist_m)) {
-    char text[200];
-    std::snprintf(
-        text, sizeof(text),
-        "odometry: within a second its pose moves by %.2f m and its twist says %.2f m: is "
-        "the pose frozen, or of another unit?",
-        by_pose_m, way.by_twist_m);
-    note("twist", text);
-  }
-  way = {stamp, stamp, at, 0.0};
+/// Each kind of contradiction between pose and twist is told once.
+void TfPoseSource::noteTwist(const nav_msgs::Odometry& message, const Transform& T_fixed_body) {
+  const auto& linear = message.twist.twist.linear;
+  const auto& angular = message.twist.twist.angular;
+  const Twist twist{{linear.x, linear.y, linear.z}, {angular.x, angular.y, angular.z}};
+  const std::optional<std::string> doubt =
+      twist_watch_.add(stampNs(message.header.stamp), T_fixed_body, twist);
+  if (doubt) note("twist", *doubt);
 }
 
 void TfPoseSource::clear() {
@@ -291,7 +271,7 @@ void TfPoseSource::clear() {
   }
   wanted_.clear();
   late_.clear();
-  travelled_ = {};
+  twist_watch_.clear();
   pending_.clear();
   counters_.odometry_pending = 0;
   odometry_ = PoseBuffer(config_.history_ns, config_.fastest_mps);

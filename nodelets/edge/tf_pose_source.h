@@ -21,6 +21,7 @@
 #include <string>
 #include <vector>
 
+#include "semantic_lidar_fusion/check/twist_watch.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/motion/pose_buffer.h"
 
@@ -122,7 +123,7 @@ class TfPoseSource {
   std::optional<Transform> poseFromEdges(StampNs stamp) const;
   std::string jumpText(StampNs stamp) const;
   void addReading(const StampedPose& reading);
-  void noteTwist(const nav_msgs::Odometry& message);
+  void noteTwist(const nav_msgs::Odometry& message, const Transform& T_fixed_body);
   bool findMovingEdges();
   void readTf();
   void readPendingOdometry();
@@ -141,12 +142,7 @@ class TfPoseSource {
   std::string problem_;
   mutable std::set<std::string> noted_;     ///< keys of what was told
   mutable std::vector<std::string> notes_;  ///< that were not taken
-  /// What the poses and the twists of nav_msgs/Odometry say since a message.
-  struct {
-    StampNs begin = 0, end = 0;
-    Eigen::Vector3d from = Eigen::Vector3d::Zero();
-    double by_twist_m = 0.0;
-  } travelled_;
+  TwistWatch twist_watch_;
 };
 
 }  // namespace semantic_lidar_fusion

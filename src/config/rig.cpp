@@ -449,6 +449,13 @@ SmoothingConfig readSmoothing(YamlSection section) {
   return smoothing;
 }
 
+CheckConfig readCheck(YamlSection section) {
+  CheckConfig check;
+  section.boolean("live", &check.live);
+  section.finish();
+  return check;
+}
+
 Rig readRig(const YAML::Node& root, const std::string& base_directory,
             const std::string& source_name, Problems* problems) {
   Rig rig;
@@ -492,6 +499,7 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
                                {"geometric_mean", OverlapRule::kGeometricMean}});
   rig.smoothing = readSmoothing(section.child("smoothing"));
   section.boolean("keep_unlabelled", &rig.keep_unlabelled);
+  rig.check = readCheck(section.child("check"));
   section.integer("threads", &rig.threads, 1, ThreadPool::kMaxThreads);
   section.finish();
   for (const std::string& problem : own) problems->push_back(source_name + ": " + problem);

@@ -54,13 +54,14 @@ CORE = {
         "config",
     },
     "overlay": {"common", "fusion"},
+    "check": {"common", "motion", "camera", "config", "fusion"},
 }
 ANY_CORE = set(CORE)
 
 # Rooms of nodelets/ ("" holds the plugins) -> the same.
 EDGE = {
-    "edge": {"common", "lidar", "motion", "camera", "sync", "config"},
-    "base": {"edge", "common", "sync", "config"},
+    "edge": {"common", "lidar", "motion", "camera", "sync", "config", "check"},
+    "base": {"edge", "common", "sync", "config", "check"},
     "": {"edge", "base"} | ANY_CORE,
     "tools/common": {"edge", "common"},
     "tools/check_network": {"common", "segmentation"},

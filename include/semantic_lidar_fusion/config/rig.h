@@ -133,6 +133,11 @@ struct SegmentationConfig {
   SegmentationMode mode = SegmentationMode::kOnRequest;
 };
 
+/// What is looked at beside the rules that always run; see check/rig_watch.h.
+struct CheckConfig {
+  bool live = false;  ///< nodelets: the lidar's edges against those of the images, one scan in 100
+};
+
 struct Rig {
   /// Every key that the loader knows, with what it came to: overrides applied, defaults filled in,
   /// paths absolute, the class set in place. A rig file of its own: it loads again as this rig.
@@ -155,6 +160,7 @@ struct Rig {
   OverlapRule overlap = OverlapRule::kMean;
   SmoothingConfig smoothing;
   bool keep_unlabelled = true;
+  CheckConfig check;
   int threads = 1;  ///< that share the cameras of a scan; results do not depend on it
 
   /// Index of the reference camera; -1 without cameras.

@@ -60,19 +60,20 @@ FusionRun::FusionRun(const FuseBagOptions& options, const std::vector<OutputOpti
       rig_(rigs.front()),
       input_(input),
       ahead_s_(ahead_s),
+      watch_(rig_),
       poses_(tfPoseSourceConfig(rig_, 0)),
       outputs_(madeOutputs(options, outputs, rigs)),
-      reader_(input, rig_, windowOf(options, !ahead_s), &poses_, &drops_,
+      reader_(input, rig_, windowOf(options, !ahead_s), &poses_, &drops_, &watch_,
               [this](const rosbag::MessageInstance& message) { scans_->take(message); }),
       images_(rig_, reader_.index(), options.all),
-      places_(rig_, reader_.index(), poses_, &drops_),
+      places_(rig_, reader_.index(), poses_, &drops_, &watch_),
       progress_("fusing", reader_.scanCount(), !options.quiet),
       most_under_way_(static_cast<std::size_t>(options.jobs) + 2) {
   const bool takes_truth =
       std::any_of(outputs.begin(), outputs.end(),
                   [](const OutputOptions& output) { return output.true_visibility; });
   if (takes_truth) truth_.emplace(input, toNs(rig_.lidar.time_offset_s));
-  scans_ = std::make_unique<ScanSource>(rig_, reader_.index(), images_, &places_, &drops_);
+  scans_ = std::make_unique<ScanSource>(rig_, reader_.index(), images_, &places_, &drops_, &watch_);
 }
 
 // --- The lines, from the end of a scan's way to its beginning
@@ -100,6 +101,7 @@ bool FusionRun::fuse(void (*checkpoint)()) {
   }
   reader_.finish();
   scans_->tellNotes();
+  tellDoubts();
   if (options_.tf) {
     for (FusedOutput& output : outputs_) output.copyTransforms(reader_.index().transforms);
   }
@@ -221,6 +223,11 @@ void FusionRun::start(BagScan scan) {
 void FusionRun::plan(const std::shared_ptr<ScanTask>& task) {
   TimedCloud raw = scans_->points(&task->scan);
   const std::vector<ros::Time> info_times = infoTimes(task->scan);
+  if (rig_.motion_enabled) {
+    const auto T_vehicle_lidar =
+        places_.extrinsics(rig_.vehicle_frame, raw.frame_id, "all points have status 4");
+    if (T_vehicle_lidar) watch_.lookAtMotion(raw, poses_.odometry(), *T_vehicle_lidar);
+  }
   const auto& cameras = reader_.index().cameras;
   decided_.push_back({task->scan, camerasWithInfo(), posesAround(task->scan)});
 
@@ -231,7 +238,9 @@ void FusionRun::plan(const std::shared_ptr<ScanTask>& task) {
     if (!stamp || !place.model) continue;
     bool is_new = false;
     task->images[c] = images_.find(c, *stamp, place.model->imageSize(), &is_new);
-    if (is_new) task->new_images.push_back(task->images[c]);
+    if (!is_new) continue;
+    task->images[c]->keeps_pixels = task->scan.number % RigWatch::kEdgesEvery == 0;
+    task->new_images.push_back(task->images[c]);
   }
   for (FusedOutput& output : outputs_) {
     task->outputs.push_back(output.plan(*task, raw, &poses_, &places_, info_times,
@@ -298,6 +307,21 @@ void FusionRun::writeScan(const ScanTask& task) {
 
 // --- Reports
 
+/// What was read, and what of it came out, where it looks wrong; one line for each doubt.
+void FusionRun::tellDoubts() {
+  std::vector<RigDoubt> doubts = watch_.takeDoubts();
+  for (FusedOutput& output : outputs_) {
+    output.finish();
+    for (RigDoubt& doubt : output.watch().takeDoubts()) doubts.push_back(std::move(doubt));
+  }
+  for (const RigDoubt& doubt : doubts) {
+    const std::string text = doubt.subject + ": " + doubt.text;
+    if (std::find(doubts_.begin(), doubts_.end(), text) != doubts_.end()) continue;
+    doubts_.push_back(text);
+    DropLog::warn("check: " + text);
+  }
+}
+
 std::map<std::string, std::uint64_t> FusionRun::dropsOf(const FusedOutput& output) const {
   std::map<std::string, std::uint64_t> drops = drops_.counts();
   for (const auto& drop : output.drops().counts()) drops[drop.first] += drop.second;
@@ -326,8 +350,13 @@ std::string FusionRun::summary() const {
     input.time_decision = scans_->timeDecision();
     for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
       const CameraTrack& track = reader_.index().cameras[c];
-      input.cameras.push_back({rig_.cameras[c].name, track.images.size(), track.semantics.size()});
+      input.cameras.push_back({rig_.cameras[c].name, track.images.size(), track.semantics.size(),
+                               output.watch().figures(c)});
     }
+    input.doubts = doubts_;
+    input.check_command = "check_rig.py";
+    for (const std::string& bag : options_.inputs) input.check_command += " " + bag;
+    input.check_command += " --rig " + options_.rig;
     text += output.report().text(input, dropsOf(output));
   }
   return text;

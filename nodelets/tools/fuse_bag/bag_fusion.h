@@ -70,6 +70,7 @@ class FusionRun {
   std::ptrdiff_t camerasWithInfo() const;
   bool holds(const Decided& decided);
   void lookAgain();
+  void tellDoubts();
   std::map<std::string, std::uint64_t> dropsOf(const FusedOutput& output) const;
 
   const FuseBagOptions& options_;
@@ -77,6 +78,8 @@ class FusionRun {
   const BagInput& input_;
   std::optional<double> ahead_s_;
   DropLog drops_;
+  RigWatch watch_;  ///< of what is read
+  std::vector<std::string> doubts_;
   TfPoseSource poses_;
   std::deque<FusedOutput> outputs_;
   std::unique_ptr<ScanSource> scans_;

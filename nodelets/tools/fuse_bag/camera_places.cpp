@@ -10,8 +10,13 @@
 namespace semantic_lidar_fusion {
 
 CameraPlaces::CameraPlaces(const Rig& rig, const DriveIndex& index, const TfPoseSource& poses,
-                           DropLog* drops)
-    : rig_(rig), index_(index), poses_(poses), drops_(*drops), models_(rig.cameras.size()) {}
+                           DropLog* drops, RigWatch* watch)
+    : rig_(rig),
+      index_(index),
+      poses_(poses),
+      drops_(*drops),
+      watch_(*watch),
+      models_(rig.cameras.size()) {}
 
 CameraPlace CameraPlaces::at(std::size_t camera, const ros::Time& time,
                              const std::string& lidar_frame) {
@@ -38,6 +43,7 @@ std::shared_ptr<const CameraModel> CameraPlaces::model(std::size_t camera, const
   std::shared_ptr<const CameraModel> result;
   try {
     result = std::make_shared<const CameraModel>(info, config.modelOptions());
+    watch_.lookAtInfo(camera, info, *result);
   } catch (const DataError& e) {
     drops_.count("camera " + config.name + ": unusable camera_info",
                  inputTopic(config, config.camera_info) + ": " + e.what());

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "edge/tf_pose_source.h"
+#include "semantic_lidar_fusion/check/rig_watch.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "tools/fuse_bag/drive_reader.h"
@@ -20,8 +21,9 @@ namespace semantic_lidar_fusion {
 
 class CameraPlaces {
  public:
-  /// Keeps the references.
-  CameraPlaces(const Rig& rig, const DriveIndex& index, const TfPoseSource& poses, DropLog* drops);
+  /// Keeps the references. `watch` is shown each calibration once.
+  CameraPlaces(const Rig& rig, const DriveIndex& index, const TfPoseSource& poses, DropLog* drops,
+               RigWatch* watch);
 
   /// With the camera_info that holds at record time `time`.
   CameraPlace at(std::size_t camera, const ros::Time& time, const std::string& lidar_frame);
@@ -38,6 +40,7 @@ class CameraPlaces {
   const DriveIndex& index_;
   const TfPoseSource& poses_;
   DropLog& drops_;
+  RigWatch& watch_;
   /// By camera.
   std::vector<std::vector<std::pair<CameraInfo, std::shared_ptr<const CameraModel>>>> models_;
   std::map<std::pair<std::string, std::string>, std::optional<Transform>> extrinsics_;

@@ -231,7 +231,10 @@ class DriveReader::Router {
       return;
     }
     handlers_[topic].push_back([this](const rosbag::MessageInstance& m) {
-      if (!poses_->add(*instantiate<nav_msgs::Odometry>(m))) {
+      const auto odometry = instantiate<nav_msgs::Odometry>(m);
+      reader_.watch_.lookAtArrival(m.getTopic(), stampNs(odometry->header.stamp),
+                                   stampNs(m.getTime()));
+      if (!poses_->add(*odometry)) {
         drops_->add("odometry: unusable", 1);  // its note says why
       }
       poses_->read();
@@ -276,7 +279,7 @@ ros::Time moved(const ros::Time& time, double seconds) {
 }  // namespace
 
 DriveReader::DriveReader(const BagInput& input, const Rig& rig, const ReadingWindow& window,
-                         TfPoseSource* poses, DropLog* drops, TakeScan take_scan)
+                         TfPoseSource* poses, DropLog* drops, RigWatch* watch, TakeScan take_scan)
     : input_(input),
       rig_(rig),
       most_kept_bytes_(window.kept_bytes),
@@ -284,6 +287,7 @@ DriveReader::DriveReader(const BagInput& input, const Rig& rig, const ReadingWin
       end_(window.end_s ? moved(input.beginTime(), *window.end_s) : ros::TIME_MAX),
       poses_(*poses),
       drops_(*drops),
+      watch_(*watch),
       take_scan_(std::move(take_scan)) {
   if (window.start_s > 0.0) begin_ = moved(start_, -window.before_s);
   index_.cameras.resize(rig.cameras.size());
@@ -398,6 +402,7 @@ void DriveReader::addImage(const rosbag::MessageInstance& message, const std::st
   const ros::Time time =
       whole ? whole->header.stamp : instantiate<StampedMessage>(message)->header.stamp;
   const StampNs stamp = stampNs(time);
+  watch_.lookAtArrival(message.getTopic(), stamp, stampNs(message.getTime()));
   if (stamp == 0) {
     drops_.count(what + ": stamp 0", message.getTopic() + ": message with stamp 0 is dropped");
     return;

@@ -21,6 +21,7 @@
 
 #include "edge/tf_pose_source.h"
 #include "semantic_lidar_fusion/camera/camera_model.h"
+#include "semantic_lidar_fusion/check/rig_watch.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "tools/common/bag_input.h"
 #include "tools/fuse_bag/drop_log.h"
@@ -75,10 +76,10 @@ class DriveReader {
   using TakeScan = std::function<void(const rosbag::MessageInstance&)>;
 
   /// Topics of the rig that the bag lacks, or has with another type, are named with what is there:
-  /// for the lidar in an Error, else as a warning. `poses` receives static transforms first. Keeps
-  /// the references.
+  /// for the lidar in an Error, else as a warning. `poses` receives static transforms first;
+  /// `watch` is shown when images and odometry were recorded. Keeps the references.
   DriveReader(const BagInput& input, const Rig& rig, const ReadingWindow& window,
-              TfPoseSource* poses, DropLog* drops, TakeScan take_scan);
+              TfPoseSource* poses, DropLog* drops, RigWatch* watch, TakeScan take_scan);
   ~DriveReader();
 
   /// Reads one message; false if there is no other.
@@ -121,6 +122,7 @@ class DriveReader {
   ros::Time start_, end_;            ///< of the scans that count
   TfPoseSource& poses_;
   DropLog& drops_;
+  RigWatch& watch_;
   TakeScan take_scan_;
   DriveIndex index_;
   std::unique_ptr<Router> router_;

@@ -26,7 +26,8 @@ FusedOutput::FusedOutput(const FuseBagOptions& options, const OutputOptions& out
                 {PipelineStep::kCompensate, PipelineStep::kView, PipelineStep::kFuse}),
       bag_(output.path, "fuse_bag", options.force ? Existing::kReplace : Existing::kReplaceOwn),
       writer_(rig_, &bag_),
-      report_(rig.cameras.size()) {
+      report_(rig.cameras.size()),
+      watch_(rig_) {
   if (!options.uncompressed) bag_.compress();
 }
 
@@ -40,6 +41,7 @@ OutputTask FusedOutput::plan(const ScanTask& task, TimedCloud raw, TfPoseSource*
       rig_.motion_enabled
           ? places->extrinsics(rig_.vehicle_frame, lidar_frame, "all points have status 4")
           : std::nullopt;
+  result.T_vehicle_lidar = T_vehicle_lidar;
   const PoseBuffer& odometry = poses->odometry();
   result.rigid = pipeline_.compensate(std::move(raw), scan.reference_ns, odometry, T_vehicle_lidar);
   result.gaps.resize(rig_.cameras.size());
@@ -113,6 +115,7 @@ void FusedOutput::write(const ScanTask& task, const OutputTask& result) {
     if (!result.failure.empty()) throw DataError(result.failure);
     writeScan(task, result);
     count(task, result);
+    watchScan(task, result);
   } catch (const DataError& e) {
     drops_.count("scans: not fused",
                  "scan " + std::to_string(task.scan.number) + " is dropped: " + e.what());
@@ -127,6 +130,21 @@ void FusedOutput::writeScan(const ScanTask& task, const OutputTask& result) {
                     result.clouds);
   if (all_) writer_.writeOverlays(result.result, task.images, result.views, reference_ns);
   report_.countScan(result.result.cloud.points);
+}
+
+/// Shows the watch what a scan came to.
+void FusedOutput::watchScan(const ScanTask& task, const OutputTask& result) {
+  for (const auto& image : task.new_images) {
+    if (!hasImage(image)) continue;
+    watch_.lookAtSemantics(image->camera, image->image->input, image->size);
+  }
+  watch_.lookAtFusion(result.result.cloud, result.views, result.T_vehicle_lidar);
+  if (!watch_.edgesAreDue()) return;
+  std::vector<cv::Mat> pixels;
+  for (const auto& image : task.images) {
+    pixels.push_back(hasImage(image) ? image->image->image : cv::Mat());
+  }
+  watch_.lookAtEdges(lidarEdges(result.rigid.cloud), result.views, pixels);
 }
 
 void FusedOutput::count(const ScanTask& task, const OutputTask& result) {

@@ -33,6 +33,7 @@ struct OutputTask {
   };
 
   CompensationResult rigid;
+  std::optional<Transform> T_vehicle_lidar;
   std::vector<CameraPlace> places;  ///< by camera
   std::vector<CameraView> views;    ///< by camera
   std::vector<std::string> gaps;    ///< by camera: why odometry does not cover its image
@@ -79,12 +80,18 @@ class FusedOutput {
   const Rig& rig() const { return rig_; }
   const RunReport& report() const { return report_; }
   const DropLog& drops() const { return drops_; }
+  /// What was written is all.
+  void finish() { watch_.finish(); }
+  /// Its doubts are to be taken and told by the caller.
+  RigWatch& watch() { return watch_; }
+  const RigWatch& watch() const { return watch_; }
 
  private:
   void planDrops(const BagScan& scan, bool has_vehicle_extrinsics, TfPoseSource* poses,
                  OutputTask* result) const;
   void writeScan(const ScanTask& task, const OutputTask& result);
   void count(const ScanTask& task, const OutputTask& result);
+  void watchScan(const ScanTask& task, const OutputTask& result);
 
   std::string path_;
   bool takes_truth_;
@@ -97,6 +104,7 @@ class FusedOutput {
   RunReport report_;
   DropLog drops_;
   CalibrationNotes calibration_notes_;
+  RigWatch watch_;
 };
 
 }  // namespace semantic_lidar_fusion

@@ -95,9 +95,11 @@ void ImageSource::make(ImageTask* task) {
     checkSize(*image, task->size);
     pipeline_.segment(task->camera, image.get());
     if (!keep_pixels_) {
-      image->image.release();
+      if (!task->keeps_pixels) image->image.release();
       image->superpixels = SuperpixelMap();
-      image->owner = std::make_shared<const sensor_msgs::ImageConstPtr>(task->semantics);
+      using Kept = std::pair<sensor_msgs::ImageConstPtr, sensor_msgs::ImageConstPtr>;
+      image->owner = std::make_shared<const Kept>(
+          task->semantics, task->keeps_pixels ? task->pixels : sensor_msgs::ImageConstPtr());
     }
     task->image = image;
   } catch (const DataError& e) {

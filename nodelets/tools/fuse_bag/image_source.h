@@ -27,6 +27,7 @@ struct ImageTask {
   std::shared_ptr<const SegmentedImage> image;
   std::string failure;
   bool is_made = false;
+  bool keeps_pixels = false;  ///< also those that nothing but a comparison of edges needs
 };
 
 class ImageSource {

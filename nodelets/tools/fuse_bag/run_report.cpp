@@ -18,6 +18,17 @@ std::string count(std::uint64_t n, const std::string& thing) {
   return std::to_string(n) + " " + thing + (n == 1 ? "" : "s");
 }
 
+/// What a camera gave, and whether the lidar's edges lie on those of its images.
+std::string figuresText(const RigWatch::CameraFigures& figures) {
+  std::string text = percent(figures.points, figures.fused_points) + " of the fused points";
+  if (figures.edges.edges > 0) {
+    char lift[32];
+    std::snprintf(lift, sizeof(lift), "; edges meet with %.2f", figures.edges.lift());
+    text += lift;
+  }
+  return text;
+}
+
 }  // namespace
 
 void RunReport::countScan(const Cloud& semantic) {
@@ -51,13 +62,16 @@ std::string RunReport::text(const Input& input,
             std::to_string(scans(Contribution::kNone)) + ", image not usable in " +
             std::to_string(scans(Contribution::kLost)) + "; " +
             count(input.cameras[c].images, "image") + " and " +
-            std::to_string(input.cameras[c].scores) + " of scores in the bag\n";
+            std::to_string(input.cameras[c].scores) + " of scores in the bag; " +
+            figuresText(input.cameras[c].figures) + "\n";
   }
   if (!input.time_decision.empty()) text += "  " + input.time_decision + "\n";
   if (drops.empty()) text += "  nothing was dropped\n";
   for (const auto& drop : drops) {
     text += "  counted: " + drop.first + ": " + std::to_string(drop.second) + "\n";
   }
+  for (const std::string& doubt : input.doubts) text += "  check: " + doubt + "\n";
+  if (!input.doubts.empty()) text += "  " + input.check_command + " tells more\n";
   const double seconds =
       std::chrono::duration<double>(std::chrono::steady_clock::now() - started_).count();
   char time[80];

@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "semantic_lidar_fusion/check/rig_watch.h"
 #include "semantic_lidar_fusion/common/point_cloud.h"
 
 namespace semantic_lidar_fusion {
@@ -26,13 +27,16 @@ class RunReport {
     std::string name;
     std::size_t images = 0;
     std::size_t scores = 0;
+    RigWatch::CameraFigures figures;
   };
   /// What the run was given.
   struct Input {
     std::string output;  ///< name of the output
     std::size_t scans = 0;
     std::vector<CameraContents> cameras;
-    std::string time_decision;  ///< how the times of points are understood
+    std::string time_decision;        ///< how the times of points are understood
+    std::vector<std::string> doubts;  ///< what looks wrong in the rig
+    std::string check_command;        ///< that tells more of it
   };
 
   explicit RunReport(std::size_t cameras) : cameras_(cameras) {}

@@ -7,6 +7,7 @@
 #include <limits>
 #include <utility>
 
+#include "edge/conversions.h"
 #include "edge/velodyne_messages.h"
 #include "semantic_lidar_fusion/common/error.h"
 
@@ -19,12 +20,13 @@ constexpr std::size_t kMostWithPoints = 64;
 }  // namespace
 
 ScanSource::ScanSource(const Rig& rig, const DriveIndex& index, const ImageSource& images,
-                       CameraPlaces* places, DropLog* drops)
+                       CameraPlaces* places, DropLog* drops, RigWatch* watch)
     : rig_(rig),
       index_(index),
       images_(images),
       places_(*places),
       drops_(*drops),
+      watch_(*watch),
       lidar_(rig.lidar,
              [this](const std::string& reason, std::uint64_t n) {
                if (counts_points_) drops_.add("lidar: " + reason, n);
@@ -50,6 +52,8 @@ void ScanSource::take(const rosbag::MessageInstance& message) {
   scan.image_stamps.resize(rig_.cameras.size());
   try {
     TimedCloud cloud = decode(message);
+    watch_.lookAtArrival(message.getTopic(), cloud.header_stamp, stampNs(message.getTime()));
+    watch_.lookAtScan(cloud);
     scan.times.interval = scanInterval(cloud);
     scan.empty = cloud.empty();
     if (scan.times.interval.first_ns <= 0) throw DataError("has stamp 0");

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "edge/lidar_decoder.h"
+#include "semantic_lidar_fusion/check/rig_watch.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 #include "tools/fuse_bag/camera_places.h"
@@ -36,9 +37,9 @@ struct BagScan {
 
 class ScanSource {
  public:
-  /// Keeps the references.
+  /// Keeps the references. `watch` is shown each scan once.
   ScanSource(const Rig& rig, const DriveIndex& index, const ImageSource& images,
-             CameraPlaces* places, DropLog* drops);
+             CameraPlaces* places, DropLog* drops, RigWatch* watch);
 
   /// The next scan of the bag: decoded for its times. One that cannot be used is counted.
   void take(const rosbag::MessageInstance& message);
@@ -67,6 +68,7 @@ class ScanSource {
   const ImageSource& images_;
   CameraPlaces& places_;
   DropLog& drops_;
+  RigWatch& watch_;
   bool counts_points_ = true;  ///< scans may be decoded twice, their points are counted once
   LidarDecoder lidar_;
   SelectorConfig selection_;
