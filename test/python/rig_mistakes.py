@@ -23,7 +23,10 @@ from semantic_lidar_fusion.bags.poses import (
 )
 
 LIDAR, FRONT, LEFT = "/points", "front", "left"
-SOURCES = {FRONT: "A0", LEFT: "B0"}
+# The simulator's cameras by the vehicle's names for them.
+PLAIN = {FRONT: "A0", LEFT: "B0"}
+REFERENCE = {FRONT: "A0", LEFT: "B0", "front_left": "A1", "front_right": "A2", "right": "B1"}
+VEHICLES = {"plain": PLAIN, "reference": REFERENCE}
 OPTICAL_FROM_BODY = np.eye(4)
 OPTICAL_FROM_BODY[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
 
@@ -35,9 +38,9 @@ class Item:
     stamp_ns: int
 
 
-def plain_bag(drive: str, raw_clouds: str) -> List[Item]:
-    """The messages of the plain vehicle. `drive`: a bag of simulate_drive; `raw_clouds`: what
-    fuse_bag makes of it with motion.enabled=false."""
+def plain_bag(drive: str, raw_clouds: str, sources: Dict[str, str] = PLAIN) -> List[Item]:
+    """The messages of a vehicle with the cameras `sources`. `drive`: a bag of simulate_drive;
+    `raw_clouds`: what fuse_bag makes of it with motion.enabled=false."""
     items: List[Item] = []
     with BagReader(raw_clouds) as reader:
         for entry in reader.read(["/points_compensated"]):
@@ -46,7 +49,7 @@ def plain_bag(drive: str, raw_clouds: str) -> List[Item]:
         for entry in reader.read():
             if entry.topic in ("/tf", "/tf_static"):
                 items.append(Item(entry.topic, entry.message, entry.stamp_ns))
-            for name, source in SOURCES.items():
+            for name, source in sources.items():
                 part = entry.topic.replace("/gmsl/%s/" % source, "")
                 if part == entry.topic:
                     continue
@@ -101,14 +104,18 @@ def _labels(scores: Any) -> Any:
     return _image(scores, scores_of(scores).argmax(axis=2).astype(np.uint8), "mono8")
 
 
-def rig(classes: str) -> Dict[str, Any]:
-    """The right rig of the plain vehicle; `classes`: path of its class set."""
+def rig(classes: str, sources: Dict[str, str] = PLAIN) -> Dict[str, Any]:
+    """The right rig of a vehicle; `classes`: path of its class set."""
     return {
         "name": "plain",
         "classes": {"file": classes},
         "cameras": [
-            {"name": FRONT, "transport": "compressed"},
-            {"name": LEFT, "transport": "compressed", "input": "labels"},
+            {
+                "name": name,
+                "transport": "compressed",
+                "input": "labels" if name == LEFT else "scores",
+            }
+            for name in sources
         ],
         "lidar": {"input": "points", "topic": LIDAR},
         "fixed_frame": "odom",
@@ -162,7 +169,7 @@ def _static(items: List[Item], change: Callable[[str, np.ndarray], np.ndarray]) 
 def _camera_frames(items: List[Item]) -> Dict[str, str]:
     frames = {}
     for item in items:
-        for name in SOURCES:
+        for name in (FRONT, LEFT):
             if item.topic == "/%s/camera_info" % name:
                 frames[name] = item.message.header.frame_id
     return frames
@@ -354,7 +361,7 @@ def _twice(items: List[Item]) -> None:
 
 
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
-SCORES, IMAGES = "/front/scores", r"/(front|left)/(image/compressed|scores|labels)"
+SCORES, IMAGES = "/front/scores", r"/\w+/(image/compressed|scores|labels)"
 
 ORDINARY = [
     Mistake("extrinsics inverted", "extrinsics are inverted", _cameras(invert)),
@@ -422,3 +429,4 @@ FURTHER = [
     ),
     Mistake("lidar 0.1 s of another clock", "differ from the lidar|scan", _stamps(-0.06, LIDAR)),
 ]
+ALL = ORDINARY + FURTHER

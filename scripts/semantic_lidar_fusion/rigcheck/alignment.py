@@ -25,11 +25,18 @@ CANNY = (30, 90)
 CHANCE_WINDOW_PX = 61
 MAX_EDGES = 9000  # of one camera: more change nothing but the time
 
-PITCH, YAW, ROLL, TIME = range(4)
+PITCH, YAW, ROLL, TIME, HEIGHT = range(5)
 AXES = ("pitch", "yaw", "roll", "time")
-# How far is searched, and the step of comparable effect: rad, rad, rad, s.
+# How far is searched, and the step of comparable effect: rad, rad, rad, s, m.
 SEARCH = np.array([np.radians(2.0), np.radians(2.0), np.radians(2.0), 0.05])
-STEP = np.array([np.radians(0.3), np.radians(0.3), np.radians(0.6), 0.006])
+STEP = np.array([np.radians(0.3), np.radians(0.3), np.radians(0.6), 0.006, 0.01])
+# A camera that stands a few centimetres higher looks like one that is pitched, the more the nearer
+# the edges are. A target at 2 m cannot tell them apart, so that good calibrations are wrong in both:
+# the search lets the height go by this much, and reports the pitch.
+MAX_HEIGHT_M = 0.02
+# Offsets whose lift is within this share of the best are as good: half their span belongs to the
+# half-width, and of pitch, which is flat, their middle is reported.
+AS_GOOD = 0.03
 GRID = (33, 33, 17, 33)
 FAR_TIME_S = 0.3
 
@@ -42,6 +49,10 @@ PROBE = np.array([np.radians(1.0), np.radians(1.0), np.radians(1.5), 0.02])
 MIN_CONTRAST = np.array([0.2, 0.2, 0.1, 0.15])
 # What the method itself leaves open on data of known truth, in deg and s.
 FLOOR = np.array([np.radians(0.1), np.radians(0.06), np.radians(0.15), 0.0007])
+
+# A rolling shutter: how far is searched, s, and what is needed to see it.
+MAX_READOUT_S, READOUT_STEPS, READOUT_PROBE_S = 0.06, 20, 0.03
+READOUT_FLOOR_S, MIN_READOUT_CONTRAST = 0.003, 0.05
 
 Projection = Callable[[np.ndarray], Tuple[np.ndarray, np.ndarray]]
 
@@ -176,6 +187,8 @@ class Stack:
     ) -> Tuple[np.ndarray, np.ndarray]:
         turn = rotation(x[:3]) @ T_camera_vehicle[:3, :3]
         shift = rotation(x[:3]) @ T_camera_vehicle[:3, 3]
+        if len(x) > HEIGHT:
+            shift = shift + (0.0, x[HEIGHT], 0.0)
         points = self.points + x[TIME] * self.passing if x[TIME] else self.points
         return project(points @ turn.T + shift)
 
@@ -186,12 +199,32 @@ class Stack:
         pixels, valid = self._project(project, T_camera_vehicle, offset)
         return pixels[valid]
 
+    def row_score(
+        self,
+        project: Projection,
+        T_camera_vehicle: np.ndarray,
+        x: np.ndarray,
+        readout_s: float,
+        by_columns: bool,
+    ) -> float:
+        """The lift with rows (columns) taken one after the other, the middle one at the stamp."""
+        pixels, valid = self._project(project, T_camera_vehicle, x)
+        axis = 0 if by_columns else 1
+        size = self.value.shape[2 - axis]
+        share = np.where(valid, (pixels[:, axis] + 0.5) * self.scale / size - 0.5, 0.0)
+        moved = self.points
+        self.points = moved + (readout_s * share)[:, None] * self.passing
+        try:
+            return self.score(project, T_camera_vehicle, x).lift
+        finally:
+            self.points = moved
+
     def score(
         self, project: Projection, T_camera_vehicle: np.ndarray, offset: Optional[np.ndarray] = None
     ) -> Score:
-        """Of extrinsics and times that are `offset` (4,) off: rotation of the camera about its own
-        x (pitch), y (yaw), z (roll), rad, applied after T_camera_vehicle; seconds that images are
-        later than stamped."""
+        """Of extrinsics and times that are `offset` (4,) or (5,) off: rotation of the camera about its
+        own x (pitch), y (yaw), z (roll), rad, applied after T_camera_vehicle; seconds that images are
+        later than stamped; metres that the camera stands higher (its y points down)."""
         x = np.zeros(4) if offset is None else offset
         pixels, valid = self._project(project, T_camera_vehicle, x)
         w, view = self.weights[valid], self.view[valid]
@@ -213,7 +246,7 @@ class Alignment:
 
     offset, half_width (4,): pitch, yaw, roll (rad) and time (s), the correction to apply to the
     rig; contrast (4,): loss of lift one PROBE away; observable (4,) bool; now, best: scores of the
-    rig as it is and with the offset.
+    rig as it is and with the offset and `height_m`, which is not known to be so.
     """
 
     offset: np.ndarray
@@ -222,6 +255,7 @@ class Alignment:
     observable: np.ndarray
     now: Score
     best: Score
+    height_m: float = 0.0
 
 
 def fit(
@@ -237,26 +271,101 @@ def fit(
 
     lift = lift_of(whole)
 
-    x = _coarse(lift, free)
+    x = np.append(_coarse(lift, free), 0.0)
+    free.append(HEIGHT)
     x = _refined(lift, x, free)
     best = lift(x)
     parts = [Stack(part) for part in (views[0::2], views[1::2]) if part]
     halves = [_refined(lift_of(part), x, free) for part in parts]
-    spread = np.abs(halves[0] - halves[1]) / 2 if len(halves) == 2 else np.full(4, np.inf)
+    spread = np.abs(halves[0] - halves[1])[:4] / 2 if len(halves) == 2 else np.full(4, np.inf)
     contrast = np.zeros(4)
-    for axis in free:
-        away = []
-        for sign in (-1.0, 1.0):
-            y = x.copy()
-            y[axis] += sign * PROBE[axis]
-            away.append(lift(y))
+    middle, span = x[:4].copy(), np.zeros(4)
+    for axis in free[:-1]:
+        away = [lift(_moved(x, axis, sign * PROBE[axis])) for sign in (-1.0, 1.0)]
         contrast[axis] = (best - max(away)) / max(best, 1e-9)
+        good, span[axis] = _as_good(lift, x, axis, best)
+        if axis == PITCH:  # the valley of pitch and height is long and flat
+            middle[axis] = good
     now = whole.score(project, T_camera_vehicle)
     after = whole.score(project, T_camera_vehicle, x)
     enough = after.edges >= MIN_EDGES and best >= MIN_LIFT
-    half_width = np.hypot(FLOOR, 1.5 * spread)
+    half_width = np.sqrt(FLOOR**2 + (1.5 * spread) ** 2 + span**2)
     observable = (contrast >= MIN_CONTRAST) & enough & np.isfinite(half_width)
-    return Alignment(x, half_width, contrast, observable, now, after)
+    return Alignment(middle, half_width, contrast, observable, now, after, float(x[HEIGHT]))
+
+
+def _moved(x: np.ndarray, axis: int, by: float) -> np.ndarray:
+    y = x.copy()
+    y[axis] += by
+    return y
+
+
+def _as_good(
+    lift: Callable[[np.ndarray], float], x: np.ndarray, axis: int, best: float
+) -> Tuple[float, float]:
+    """The middle and half the length of the stretch around x on which the lift, with the best height
+    for each pitch, is as good as the best."""
+    heights = np.linspace(-MAX_HEIGHT_M, MAX_HEIGHT_M, 5) if axis == PITCH else [x[HEIGHT]]
+
+    def is_good(by: float) -> bool:
+        y = _moved(x, axis, by)
+        values = []
+        for height in heights:
+            y[HEIGHT] = height
+            values.append(lift(y))
+        return max(values) >= (1.0 - AS_GOOD) * best
+
+    ends = []
+    for sign in (-1.0, 1.0):
+        reach, step = 0.0, PROBE[axis] / 16
+        while reach < PROBE[axis] and is_good(sign * (reach + step)):
+            reach += step
+        ends.append(sign * reach)
+    return x[axis] + (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Readout:
+    """How much later the last row (column) is taken than the first: value_s, negative if it is taken
+    first, with half_width_s; contrast: loss of lift READOUT_PROBE_S away."""
+
+    value_s: float
+    half_width_s: float
+    contrast: float
+    observable: bool
+
+
+def readout(
+    views: Sequence[View],
+    project: Projection,
+    T_camera_vehicle: np.ndarray,
+    found: Alignment,
+    by_columns: bool = False,
+) -> Readout:
+    """Whether the offset in time that remains at an edge depends on its row (column): each edge is
+    moved by the time of its row before or after the middle one's, at the offset already found."""
+    stack = Stack(thinned(views))
+    x = np.append(found.offset, found.height_m)
+    tries = np.linspace(-MAX_READOUT_S, MAX_READOUT_S, 2 * READOUT_STEPS + 1)
+    lifts = np.array([stack.row_score(project, T_camera_vehicle, x, t, by_columns) for t in tries])
+    best = int(np.argmax(lifts))
+    good = lifts >= (1.0 - AS_GOOD) * lifts[best]
+    first = last = best
+    while first > 0 and good[first - 1]:
+        first -= 1
+    while last < len(tries) - 1 and good[last + 1]:
+        last += 1
+    step = tries[1] - tries[0]
+    probe = int(round(READOUT_PROBE_S / step))
+    away = lifts[[max(0, best - probe), min(len(tries) - 1, best + probe)]]
+    contrast = float((lifts[best] - away.max()) / max(lifts[best], 1e-9))
+    half = float(np.hypot(READOUT_FLOOR_S, (tries[last] - tries[first]) / 2 + step / 2))
+    seen = bool(
+        found.observable[TIME]
+        and contrast >= MIN_READOUT_CONTRAST
+        and READOUT_PROBE_S < MAX_READOUT_S - abs(tries[best])
+    )
+    return Readout(float((tries[first] + tries[last]) / 2), half, contrast, seen)
 
 
 def _coarse(lift: Callable[[np.ndarray], float], free: Sequence[int]) -> np.ndarray:
@@ -286,7 +395,7 @@ def _descend(
                 found = lift(y)
                 if found > best:
                     best, x = found, y
-        if (np.abs(x - before) < STEP / 4).all():
+        if (np.abs(x - before) < STEP[: len(x)] / 4).all():
             break
     return x
 
@@ -294,12 +403,14 @@ def _descend(
 def _refined(
     lift: Callable[[np.ndarray], float], start: np.ndarray, free: Sequence[int]
 ) -> np.ndarray:
-    """Jointly, with the simplex method, in units of STEP."""
+    """Jointly, with the simplex method, in units of STEP; the height stays within its bounds."""
     from scipy.optimize import minimize
 
     def place(z: np.ndarray) -> np.ndarray:
         x = start.copy()
         x[list(free)] += z * STEP[list(free)]
+        if len(x) > HEIGHT:
+            x[HEIGHT] = np.clip(x[HEIGHT], -MAX_HEIGHT_M, MAX_HEIGHT_M)
         return x
 
     simplex = np.vstack([np.zeros(len(free)), np.eye(len(free))])
@@ -307,6 +418,6 @@ def _refined(
         lambda z: -lift(place(z)),
         np.zeros(len(free)),
         method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": 120, "xatol": 0.02, "fatol": 1e-5},
+        options={"initial_simplex": simplex, "maxfev": 150, "xatol": 0.02, "fatol": 1e-5},
     )
     return place(found.x)

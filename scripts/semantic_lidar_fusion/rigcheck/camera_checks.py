@@ -9,7 +9,7 @@ import numpy as np
 
 from semantic_lidar_fusion.bags.poses import invert
 from semantic_lidar_fusion.cameras import Camera
-from semantic_lidar_fusion.rigcheck import alignment, scenes
+from semantic_lidar_fusion.rigcheck import alignment, scenes, stated
 from semantic_lidar_fusion.rigcheck.alignment import PITCH, ROLL, TIME, YAW, Alignment, Score, View
 from semantic_lidar_fusion.rigcheck.findings import Finding, Verdict, judged
 from semantic_lidar_fusion.rigcheck.sample import CameraSample, Sample
@@ -17,6 +17,7 @@ from semantic_lidar_fusion.rigcheck.sample import CameraSample, Sample
 # Offsets from which on a rig is suspect, and wrong: deg and s.
 SUSPECT_DEG, WRONG_DEG = 0.3, 1.0
 SUSPECT_S, WRONG_S = 0.005, 0.02
+SUSPECT_READOUT_S = 0.008
 MIN_SPEED_MPS = 1.0
 MIN_VIEWS = 3  # scans with an image; fewer say nothing against a rig
 # A mistake is named if its remedy lifts the score by this and reaches MIN_LIFT twice over.
@@ -38,6 +39,7 @@ class Aligned:
     speed_mps: float
     stamps: Dict[int, alignment.ImageEdges]  # raw stamp of an image -> its edges
     remedy: Optional["Remedy"] = None
+    readout: Optional[alignment.Readout] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +73,24 @@ def align(sample: Sample) -> List[Aligned]:
         found.append(Aligned(camera, model, T_camera_vehicle, views, result, speed, stamps))
     for one in found:
         one.remedy = _remedy(sample, one, found, edges, cache)
+        if one.remedy is None and one.result.observable[TIME]:
+            one.readout = alignment.readout(
+                one.views,
+                one.model.project,
+                one.T_camera_vehicle,
+                one.result,
+                _shutter(one.camera)[1],
+            )
     return found
+
+
+def _shutter(camera: CameraSample) -> Tuple[float, bool]:
+    """The stated readout, s, negative if the last row or column is taken first; whether it goes by
+    columns."""
+    shutter = camera.config.get("shutter") or {}
+    direction = str(shutter.get("direction", "down"))
+    sign = -1.0 if direction in ("up", "left") else 1.0
+    return sign * float(shutter.get("readout_s", 0.0)), direction in ("right", "left")
 
 
 def _remedy(
@@ -276,7 +295,7 @@ def alignment_findings(sample: Sample, aligned: List[Aligned]) -> List[Finding]:
     if common is not None:
         result.append(common)
     for one in aligned:
-        result += _one_camera(one, common is not None)
+        result += _one_camera(sample, one, common is not None)
     seen = {one.camera.name for one in aligned}
     for camera in sample.cameras:
         if camera.name not in seen:
@@ -299,7 +318,7 @@ def _lift(remedy: Remedy) -> str:
     return "edges meet with %.2f once this is corrected" % remedy.score.lift
 
 
-def _one_camera(one: Aligned, time_is_common: bool) -> List[Finding]:
+def _one_camera(sample: Sample, one: Aligned, time_is_common: bool) -> List[Finding]:
     name, found = one.camera.name, one.result
     if one.remedy is not None:
         figure = (
@@ -358,7 +377,38 @@ def _one_camera(one: Aligned, time_is_common: bool) -> List[Finding]:
             )
         )
     result.append(_time(one, time_is_common))
+    result += _readout(one)
+    result += stated.findings(name, one.camera.config, sample.rig, found)
     return result
+
+
+def _readout(one: Aligned) -> List[Finding]:
+    """Whether what remains depends on the row: the shutter."""
+    if one.readout is None:
+        return []
+    name, found = one.camera.name, one.readout
+    stated_s, by_columns = _shutter(one.camera)
+    figure = "readout %+.0f +- %.0f ms over the %s, the rig says %+.0f ms" % (
+        1e3 * found.value_s,
+        1e3 * found.half_width_s,
+        "width" if by_columns else "height",
+        1e3 * stated_s,
+    )
+    verdict = None
+    if found.observable:
+        verdict = judged(found.value_s - stated_s, found.half_width_s, SUSPECT_READOUT_S, np.inf)
+    if verdict is None:
+        return [Finding(name, "shutter", Verdict.NOT_OBSERVABLE, figure)]
+    if verdict == Verdict.OK:
+        return [Finding(name, "shutter", Verdict.OK, figure)]
+    cause = "the time of an edge depends on its row: a rolling shutter"
+    directions = ("right", "left") if by_columns else ("down", "up")
+    cure = "set cameras.%s.shutter: {readout_s: %.3f, direction: %s, stamp_row: middle}" % (
+        name,
+        abs(found.value_s),
+        directions[0] if found.value_s > 0 else directions[1],
+    )
+    return [Finding(name, "shutter", Verdict.SUSPECT, figure, cause, cure)]
 
 
 def _time(one: Aligned, is_common: bool) -> Finding:

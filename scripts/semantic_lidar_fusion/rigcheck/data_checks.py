@@ -19,23 +19,32 @@ from semantic_lidar_fusion.rigcheck.sample import (
 from semantic_lidar_fusion.rigcheck.scenes import xyz
 
 AHEAD_S = 0.02  # a stamp this far ahead of its recording is not explained by clocks that NTP keeps
+FOLD_MARGIN_DEG = 2.0  # before the fold-over, coefficients are bent already
 CENTRE_SHARE = 0.2  # of the width, from the principal point to the image's centre
+RESTART_NS = 500_000_000  # stamps that go back by more are no reordering
+MAX_DRIFT, MIN_DRIFT_SPAN_S = 2e-4, 20.0  # s/s; quartz drifts by 5e-5 at most
 MIN_SPAN_S, MAX_SPAN_S = 0.001, 1.0  # of one scan
 
 
 def bag_findings(sample: Sample) -> List[Finding]:
     """Topics, gaps, stamps ahead of their recording, duplicates, overlap."""
     needed: Dict[str, str] = {lidar_topic(sample.rig): "lidar"}
+    semantics: List[str] = []
     for camera in sample.cameras:
         needed[image_topic(camera.config)] = camera.name
         needed[
             input_topic(camera.config, str(camera.config.get("camera_info", "camera_info")))
         ] = camera.name
         if not sample.rig.get("segmentation", {}).get("model"):
-            needed[semantics_topic(camera.config)] = camera.name
+            semantics.append(semantics_topic(camera.config))
+            needed[semantics[-1]] = camera.name
     result: List[Finding] = []
     for name, sensor in needed.items():
         topic = sample.topics.get(name)
+        if topic is None and name in semantics and not _images_like(name, sample):
+            figure = "%s is not in the bag: geometry and times can be judged, classes cannot" % name
+            result.append(Finding(sensor, "topic", Verdict.NOT_OBSERVABLE, figure))
+            continue
         if topic is None:
             near = _similar(name, list(sample.topics))
             cure = "did you mean %s?" % near if near else "record it, or correct the rig's topic"
@@ -59,6 +68,13 @@ def bag_findings(sample: Sample) -> List[Finding]:
         )
         result.append(Finding("bag", "overlap", verdict, figure, "", cure))
     return result
+
+
+def _images_like(name: str, sample: Sample) -> str:
+    """An image topic that may be meant by `name`, and is no camera's; "" if there is none."""
+    taken = {image_topic(camera.config) for camera in sample.cameras}
+    kinds = {n for n, topic in sample.topics.items() if topic.kind == "sensor_msgs/Image"}
+    return _similar(name, sorted(kinds - taken))
 
 
 def _similar(name: str, names: List[str]) -> str:
@@ -101,6 +117,8 @@ def _stream(topic: Topic, sensor: str) -> List[Finding]:
         cause = "no message can arrive before its time: the clock or the stamp is wrong"
         cure = "synchronise the clocks (PTP or chrony), or set time_offset by -%.3f" % middle
         result.append(Finding(sensor, "stamps", Verdict.WRONG, figure, cause, cure))
+    else:
+        result += _clock(stamps, sensor)
     unique = np.unique(stamps[:, 0])
     if len(unique) < 0.9 * len(np.unique(stamps[:, 1])) and len(stamps) > 5:
         figure = "%d stamps for %d messages" % (len(unique), len(stamps))
@@ -109,6 +127,32 @@ def _stream(topic: Topic, sensor: str) -> List[Finding]:
             Finding(sensor, "duplicates", Verdict.SUSPECT, figure, "messages come twice", cure)
         )
     return result
+
+
+def _clock(stamps: np.ndarray, sensor: str) -> List[Finding]:
+    """How the stamps (M, 2; stamp and record time, ns, by the latter) run against the recording."""
+    back = int((np.diff(stamps[:, 0]) < -RESTART_NS).sum())
+    if back:
+        figure = "stamps go back by more than %.1f s %d times" % (RESTART_NS / 1e9, back)
+        cure = "check the driver for restarts; split the bag there"
+        return [
+            Finding(sensor, "stamps", Verdict.SUSPECT, figure, "a clock or driver restarts", cure)
+        ]
+    delay = (stamps[:, 1] - stamps[:, 0]) / 1e9
+    middle = float(np.median(delay))
+    jitter = 1.4826 * float(np.median(np.abs(delay - middle)))
+    figure = "recorded %.1f +- %.1f ms after their stamps" % (1e3 * middle, 1e3 * jitter)
+    span = float(stamps[-1, 1] - stamps[0, 1]) / 1e9
+    if span > MIN_DRIFT_SPAN_S:
+        seconds = (stamps[:, 1] - stamps[0, 1]) / 1e9
+        drift = float(np.polyfit(seconds, delay, 1)[0])
+        figure += ", drift %+.0f us/s" % (1e6 * drift)
+        # Queues jitter; a clock that drifts moves the delay by more than that.
+        if abs(drift) > MAX_DRIFT and abs(drift) * span > max(0.01, 3 * jitter):
+            cause = "the sensor's clock drifts against the recorder's"
+            cure = "synchronise the clocks (PTP or chrony)"
+            return [Finding(sensor, "stamps", Verdict.SUSPECT, figure, cause, cure)]
+    return [Finding(sensor, "stamps", Verdict.OK, figure)]
 
 
 def camera_info_findings(sample: Sample) -> List[Finding]:
@@ -123,7 +167,32 @@ def camera_info_findings(sample: Sample) -> List[Finding]:
             )
             continue
         result += _one_info(camera)
+        result += _fold_over(camera)
     return result
+
+
+def _fold_over(camera: CameraSample) -> List[Finding]:
+    """Whether the lens has a ray for every pixel; beyond the fold-over of its coefficients none has."""
+    model = camera.model()
+    if model is None:
+        return []
+    width, height = model.size
+    u, v = np.meshgrid(np.linspace(0, width - 1, 40), np.linspace(0, height - 1, 40))
+    rays = model.rays(np.column_stack([u.ravel(), v.ravel()]))
+    share = float(np.isfinite(rays).all(axis=1).mean())
+    degrees = float(np.degrees(model.max_theta))
+    figure = "no point beyond %.1f deg from the axis; %.0f %% of the image has points" % (
+        degrees,
+        100 * share,
+    )
+    if share > 0.97 or float(camera.config.get("max_theta_deg", 0.0)) > 0:
+        return [Finding(camera.name, "fold-over", Verdict.OK, figure)]
+    cause = "the lens's coefficients turn back within the image: they do not hold at its border"
+    cure = "calibrate with targets near the border, or set cameras.%s.max_theta_deg: %.0f" % (
+        camera.name,
+        np.floor(degrees - FOLD_MARGIN_DEG),
+    )
+    return [Finding(camera.name, "fold-over", Verdict.SUSPECT, figure, cause, cure)]
 
 
 def _one_info(camera: CameraSample) -> List[Finding]:
@@ -384,6 +453,10 @@ def _rings(sample: Sample) -> Finding:
 
 def points_per_camera(sample: Sample) -> List[Finding]:
     """How many of the fused points each camera contributed, from fuse_bag's own clouds."""
+    if sample.failure and not any(camera.semantics_stamps for camera in sample.cameras):
+        if not sample.rig.get("segmentation", {}).get("model"):
+            figure = "no scores, labels or probabilities in the bag: nothing is fused"
+            return [Finding("bag", "fuse_bag", Verdict.NOT_OBSERVABLE, figure)]
     if sample.failure:
         return [
             Finding(

@@ -8,6 +8,7 @@ import numpy as np
 from semantic_lidar_fusion.bags.poses import invert, to_quaternion
 from semantic_lidar_fusion.rigcheck.alignment import PITCH, ROLL, TIME, YAW, rotation
 from semantic_lidar_fusion.rigcheck.camera_checks import Aligned
+from semantic_lidar_fusion.rigcheck.data_checks import FOLD_MARGIN_DEG
 from semantic_lidar_fusion.rigcheck.findings import Finding, Verdict
 from semantic_lidar_fusion.rigcheck.sample import Sample
 
@@ -30,6 +31,14 @@ def text_of(sample: Sample, aligned: Sequence[Aligned], findings: Sequence[Findi
             half = 1e3 * one.result.half_width[TIME]
             keys.append("  # %s: +- %.1f ms" % (name, half))
             keys.append("  - {name: %s, time_offset: %.4f}" % (name, offset))
+        if (name, "fold-over") in doubtful:
+            limit = np.floor(np.degrees(one.model.max_theta) - FOLD_MARGIN_DEG)
+            keys.append("  - {name: %s, max_theta_deg: %.0f}" % (name, limit))
+        if (name, "shutter") in doubtful and one.readout is not None:
+            keys.append("  # %s: see its finding `shutter` for the direction" % name)
+            keys.append(
+                "  - {name: %s, shutter: {readout_s: %.3f}}" % (name, abs(one.readout.value_s))
+            )
         turned = [axis for axis in (PITCH, YAW, ROLL) if (name, _CHECK_OF[axis]) in doubtful]
         if turned:
             commands += _command(sample, one)

@@ -91,8 +91,8 @@ def _first_screen(findings: Sequence[Finding]) -> str:
     if not lines:
         return (
             "<div class='card'>Nothing wrong was found. What is marked <i>not observable</i> below "
+            "could not be judged with this drive.</div>"
         )
-        "could not be judged with this drive.</div>"
     return "<div class='card'><b>What is wrong, and what to do</b><ol>%s</ol></div>" % "".join(
         lines
     )

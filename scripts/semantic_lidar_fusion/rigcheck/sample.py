@@ -45,7 +45,7 @@ def header_stamp_ns(raw: RawMessage) -> int:
 @dataclasses.dataclass
 class Topic:
     """A topic of the bags: record times (M,) ns, sorted; of a sample of its messages, stamp and
-    record time (ns)."""
+    record time (ns), by the latter."""
 
     name: str
     kind: str
@@ -218,7 +218,7 @@ def sampled(
         cut = os.path.join(folder, "sample.bag")
         _cut(readers, topics, cameras, lidar, windows, chosen, small, cut)
         for topic in topics.values():
-            topic.stamps.sort()
+            topic.stamps.sort(key=lambda entry: entry[1])
 
         scans = _raw_scans(program, cut, folder, rig)
         tree, told, odometry_message = _transforms(small, rig)
