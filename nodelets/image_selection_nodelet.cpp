@@ -67,7 +67,14 @@ class ImageSelectionNodelet : public FusionNodelet {
       camera.image_selected =
           advertise<sensor_msgs::Image>(getNodeHandle(), cameraTopic(config, "image_selected"), 4);
     }
+    followTuning();
     startTicking();
+  }
+
+  void rigChanged() override {
+    for (std::size_t i = 0; i < rig().cameras.size(); ++i) {
+      selector_->setTimeOffset(static_cast<int>(i), toNs(rig().cameras[i].time_offset_s));
+    }
   }
 
   void updateSubscriptions() override {
@@ -194,7 +201,8 @@ class ImageSelectionNodelet : public FusionNodelet {
         warn("extrinsics " + camera->config.name, T_camera_lidar.message);
         continue;
       }
-      times.back() = sweepTime(cloud, {camera->geometry.model(), *T_camera_lidar.transform});
+      times.back() = sweepTime(cloud, {camera->geometry.model(),
+                                       camera->config.nudge.applied(*T_camera_lidar.transform)});
     }
     return times;
   }

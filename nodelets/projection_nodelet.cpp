@@ -13,6 +13,7 @@
 #include <vector>
 
 #include "base/fusion_nodelet.h"
+#include "base/tuning_server.h"
 #include "edge/camera_geometry.h"
 #include "edge/conversions.h"
 #include "edge/tf_subscription.h"
@@ -106,7 +107,12 @@ class ProjectionNodelet : public FusionNodelet {
       if (camera.config.withoutCameraInfo()) health().retireInput(camera.info.getTopic());
     }
     startTicking();
+    tuning_ = std::make_unique<TuningServer>(
+        getPrivateNodeHandle(), rig(), [this](const Rig& tuned) { tune(tuned); },
+        [this](const std::string& problem) { error("tuning", "set_parameters: " + problem); });
   }
+
+  void rigChanged() override { pipeline_->retune(rig()); }
 
   void updateSubscriptions() override {
     bool wanted = isWanted(output_);
@@ -334,7 +340,7 @@ class ProjectionNodelet : public FusionNodelet {
       return place;
     }
     place.model = camera.geometry.model();
-    place.T_camera_lidar = *T_camera_lidar.transform;
+    place.T_camera_lidar = camera.config.nudge.applied(*T_camera_lidar.transform);
     return place;
   }
 
@@ -422,6 +428,7 @@ class ProjectionNodelet : public FusionNodelet {
 
   std::unique_ptr<ScanPipeline> pipeline_;
   std::unique_ptr<FusionQueue> queue_;
+  std::unique_ptr<TuningServer> tuning_;
   std::unique_ptr<TfSubscription> tf_;
   std::unique_ptr<EpochMonitor> epochs_;
   std::vector<std::unique_ptr<Camera>> cameras_;

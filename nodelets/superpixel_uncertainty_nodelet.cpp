@@ -88,6 +88,13 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     if (cameras_.empty() && !only.empty()) {
       throw ConfigError({"camera: is '" + only + "', which the rig file does not list"});
     }
+    followTuning();
+  }
+
+  void rigChanged() override {
+    std::vector<std::unique_lock<std::mutex>> locks;
+    for (const auto& camera : cameras_) locks.emplace_back(camera->mutex);
+    pipeline_->retune(rig());
   }
 
   /// Different cameras run in parallel; one camera's images come one at a time.

@@ -2,7 +2,7 @@
 #include "base/fusion_nodelet.h"
 
 #include <nodelet/detail/callback_queue.h>
-#include <std_msgs/String.h>
+#include <yaml-cpp/yaml.h>
 
 #include <exception>
 #include <string>
@@ -21,6 +21,8 @@ const ros::WallDuration kDiagnosticsPeriod(1.0);
 constexpr std::chrono::seconds kJumpReportPeriod{1};
 /// How long an answer of the master is waited for.
 constexpr std::chrono::milliseconds kMasterPatience{1000};
+/// The rig as it was changed while it runs, from the nodelet that takes the changes.
+constexpr char kTunedRig[] = "tuned_rig";
 /// Lines hold texts of messages, which may hold anything.
 constexpr std::size_t kLongestLine = 2000;
 
@@ -86,6 +88,38 @@ void FusionNodelet::publishConfiguration() {
   configuration_ = getPrivateNodeHandle().advertise<std_msgs::String>("configuration", 1, true);
   configuration_.publish(configurationMessage(rig_));
   health_.set("version", kVersion);
+}
+
+void FusionNodelet::tune(const Rig& tuned) {
+  rig_.retune(tuned);
+  rigChanged();
+  const std_msgs::String message = configurationMessage(rig_);
+  configuration_.publish(message);
+  if (!tuned_) tuned_ = getNodeHandle().advertise<std_msgs::String>(kTunedRig, 1, true);
+  tuned_.publish(message);
+}
+
+void FusionNodelet::followTuning() {
+  tuned_subscriber_ = subscribe<std_msgs::String>(
+      getNodeHandle(), kTunedRig, 4,
+      [this](const std_msgs::StringConstPtr& message) { onTuned(message); }, Health::Expect::kOnce);
+  // Mostly nobody tunes.
+  health_.retireInput(tuned_subscriber_.getTopic());
+}
+
+void FusionNodelet::onTuned(const std_msgs::StringConstPtr& message) {
+  const Rig tuned = rigFromYaml(YAML::Load(message->data), ".", kTunedRig);
+  const auto names = [](const Rig& rig) {
+    std::vector<std::string> result;
+    for (const CameraConfig& camera : rig.cameras) result.push_back(camera.name);
+    return result;
+  };
+  if (names(tuned) != names(rig_)) {
+    throw DataError(std::string(kTunedRig) + ": has other cameras than this nodelet's rig");
+  }
+  rig_.retune(tuned);
+  rigChanged();
+  configuration_.publish(configurationMessage(rig_));
 }
 
 void FusionNodelet::startTicking() {

@@ -10,6 +10,7 @@
 #include <diagnostic_updater/diagnostic_updater.h>
 #include <nodelet/nodelet.h>
 #include <ros/ros.h>
+#include <std_msgs/String.h>
 
 #include <atomic>
 #include <chrono>
@@ -42,6 +43,9 @@ class FusionNodelet : public nodelet::Nodelet {
   /// Demand has changed (see isWanted): subscribe on the first listener, shut down after the last.
   /// Called with `connectMutex` held, on the MasterThread once `initialize` is over.
   virtual void updateSubscriptions() {}
+  /// rig() has other values of what may change while it runs (see Rig::retune); called one at a
+  /// time with the callbacks of getNodeHandle().
+  virtual void rigChanged() {}
   /// Called every `kTickPeriod` with now(), one at a time with the callbacks of getNodeHandle().
   virtual void tick(StampNs /*now_ns*/) {}
   /// Ends all callbacks and waits for those that run. Every destructor of a derived class calls it
@@ -49,6 +53,11 @@ class FusionNodelet : public nodelet::Nodelet {
   void stop();
   /// Asks for `tick`; call in initialize.
   void startTicking();
+
+  /// Runs with another rig from here on, and has the nodelets that follow do so.
+  void tune(const Rig& tuned);
+  /// Follows the nodelet of the same namespace that tunes; call in initialize.
+  void followTuning();
 
   const Rig& rig() const { return rig_; }
   Health& health() { return health_; }
@@ -121,6 +130,7 @@ class FusionNodelet : public nodelet::Nodelet {
   /// Asks the master which of the silent topics are advertised, and says what that means.
   void tellSilence(const SilenceWatchdog::Question& question);
   void takeQueues();
+  void onTuned(const std_msgs::StringConstPtr& message);
   /// Tells, latched, which version runs with which rig.
   void publishConfiguration();
   void startDiagnostics();
@@ -143,7 +153,8 @@ class FusionNodelet : public nodelet::Nodelet {
   ReportThrottle reports_;
   SilenceWatchdog watchdog_;
   std::unique_ptr<diagnostic_updater::Updater> diagnostics_;
-  ros::Publisher configuration_;
+  ros::Publisher configuration_, tuned_;
+  ros::Subscriber tuned_subscriber_;
   ros::WallTimer diagnostics_timer_, tick_timer_;
 };
 

@@ -102,9 +102,11 @@ Rig loadRigFromParameters(const ros::NodeHandle& node) {
 }
 
 std::vector<std::string> unknownParameters(const ros::NodeHandle& node) {
-  // `camera` is the superpixel nodelet's, `diagnostic_period` the diagnostic updater's.
-  static const std::vector<std::string> kKnown = {"rig_file",  "rig",    "rig_directory",
-                                                  "overrides", "camera", "diagnostic_period"};
+  // `camera` is the superpixel nodelet's, `tuned_rig_file` the projection's, `diagnostic_period`
+  // the diagnostic updater's.
+  static const std::vector<std::string> kKnown = {"rig_file",      "rig",    "rig_directory",
+                                                  "overrides",     "camera", "diagnostic_period",
+                                                  "tuned_rig_file"};
   std::vector<std::string> names, problems;
   node.getParamNames(names);
   const std::string prefix = node.getNamespace() + "/";

@@ -31,12 +31,12 @@ class TfSubscription {
       : source_(tfPoseSourceConfig(rig, kHistoryNs)) {
     const auto hints = ros::TransportHints().tcpNoDelay();
     static_ = handle.subscribe<tf2_msgs::TFMessage>(
-        "/tf_static", kQueue,
+        rig.tf_static_topic, kQueue,
         boost::function<void(const tf2_msgs::TFMessageConstPtr&)>(
             [this](const tf2_msgs::TFMessageConstPtr& message) { add(*message, true); }),
         ros::VoidConstPtr(), hints);
     moving_ = handle.subscribe<tf2_msgs::TFMessage>(
-        "/tf", kQueue,
+        rig.tf_topic, kQueue,
         boost::function<void(const tf2_msgs::TFMessageConstPtr&)>(
             [this](const tf2_msgs::TFMessageConstPtr& message) { add(*message, false); }),
         ros::VoidConstPtr(), hints);

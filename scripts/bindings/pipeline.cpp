@@ -49,7 +49,7 @@ class Pipeline {
         const auto known = cameras.find(camera.name);
         CameraPlace place;
         if (known != cameras.end()) {
-          place = {known->second.first, transformOf(known->second.second)};
+          place = {known->second.first, camera.nudge.applied(transformOf(known->second.second))};
         }
         times.sweep_ns.push_back(sweepTime(scan.cloud, place));
       }
@@ -109,7 +109,8 @@ class Pipeline {
       throw DataError("the image is of camera " + rig_->cameras[image->camera].name + ", not of " +
                       camera);
     }
-    const CameraPlace place{std::move(model), transformOf(T_camera_lidar)};
+    const CameraPlace place{std::move(model),
+                            rig_->cameras[index].nudge.applied(transformOf(T_camera_lidar))};
     if (image && place.model && !image->image.image.empty()) {
       const ImageSize size{image->image.image.cols, image->image.image.rows};
       if (size != place.model->imageSize()) {

@@ -190,6 +190,26 @@ RowBand readRows(YamlSection section) {
   return rows;
 }
 
+/// Three numbers of a list, each within the range.
+void readTriple(YamlSection* section, const std::string& key, std::array<double, 3>* values,
+                double most) {
+  std::vector<double> list(values->begin(), values->end());
+  section->numbers(key, &list, {-most, most});
+  if (list.size() != values->size()) {
+    section->problem(key, "must be three numbers, for x, y and z");
+    return;
+  }
+  std::copy(list.begin(), list.end(), values->begin());
+}
+
+CameraNudge readNudge(YamlSection section) {
+  CameraNudge nudge;
+  readTriple(&section, "deg", &nudge.deg, 180.0);
+  readTriple(&section, "m", &nudge.m, 10.0);
+  section.finish();
+  return nudge;
+}
+
 CameraConfig readCamera(const YAML::Node& node, std::size_t index,
                         const std::string& base_directory, Problems* problems, YamlTree* list) {
   CameraConfig camera;
@@ -232,6 +252,7 @@ CameraConfig readCamera(const YAML::Node& node, std::size_t index,
     section.problem("lens", "must be left out where `rectified` is true");
   }
   camera.shutter = readShutter(section.child("shutter"));
+  camera.nudge = readNudge(section.child("nudge"));
   section.number("time_offset", &camera.time_offset_s, kOffset);
   section.number("max_time_difference", &camera.max_time_difference_s, {0, kMaxTimeDifference_s});
   section.number("timeout", &camera.timeout_s, kWait);
@@ -476,6 +497,12 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
   section.keep("classes", rig.classes.size() > 0 ? classesTree(rig.classes) : YamlTree());
   section.keep("cameras", std::move(cameras));
   rig.lidar = readLidar(section.child("lidar"), &own);
+  {
+    YamlSection tf = section.child("tf");
+    readTopic(tf, "topic", &rig.tf_topic);
+    readTopic(tf, "static_topic", &rig.tf_static_topic);
+    tf.finish();
+  }
   readFrame(section, "fixed_frame", true, &rig.fixed_frame);
   readFrame(section, "vehicle_frame", true, &rig.vehicle_frame);
   rig.superpixels = readSuperpixels(section.child("superpixels"));
@@ -601,6 +628,32 @@ PointCloudReaderConfig LidarConfig::cloudConfig() const {
   config.largest_coordinate_m = largest_coordinate_m;
   config.longest_scan_ns = toNs(longest_scan_s);
   return config;
+}
+
+Transform CameraNudge::applied(const Transform& T_camera_lidar) const {
+  if (*this == CameraNudge{}) return T_camera_lidar;
+  const auto about = [this](std::size_t axis) {
+    return Eigen::AngleAxisd(deg[axis] * kPi / 180.0,
+                             Eigen::Vector3d::Unit(static_cast<Eigen::Index>(axis)));
+  };
+  Transform T_lidar_camera = T_camera_lidar.inverse(Eigen::Isometry);
+  const Eigen::Matrix3d turn = (about(2) * about(1) * about(0)).toRotationMatrix();
+  T_lidar_camera.linear() = turn * T_lidar_camera.linear();
+  T_lidar_camera.translation() += Eigen::Vector3d(m[0], m[1], m[2]);
+  return T_lidar_camera.inverse(Eigen::Isometry);
+}
+
+void Rig::retune(const Rig& other) {
+  yaml = other.yaml;
+  uncertainty = other.uncertainty;
+  occlusion = other.occlusion;
+  overlap = other.overlap;
+  smoothing = other.smoothing;
+  threads = other.threads;
+  for (std::size_t i = 0; i < cameras.size() && i < other.cameras.size(); ++i) {
+    cameras[i].time_offset_s = other.cameras[i].time_offset_s;
+    cameras[i].nudge = other.cameras[i].nudge;
+  }
 }
 
 int Rig::referenceCamera() const {

@@ -93,6 +93,11 @@ ScanPipeline::ScanPipeline(const Rig& rig, const PipelineSteps& steps) : rig_(ri
 
 ScanPipeline::~ScanPipeline() = default;
 
+void ScanPipeline::retune(const Rig& rig) {
+  rig_.retune(rig);
+  if (projector_) projector_ = std::make_unique<SemanticProjector>(fusionConfig(rig_));
+}
+
 bool ScanPipeline::has(PipelineStep step) const {
   return (steps_ >> static_cast<unsigned>(step) & 1u) != 0;
 }

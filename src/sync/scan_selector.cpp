@@ -11,6 +11,8 @@
 namespace semantic_lidar_fusion {
 namespace {
 
+/// Of a camera's clock.
+constexpr StampNs kMaxOffsetNs = 1000000000 * kNsPerSecond;
 /// Bounds of memory where stamps are absurdly dense; 30 Hz for five minutes are 9000 images.
 constexpr std::size_t kMaxImages = 16384;
 constexpr std::size_t kLeastKnownScans = 64;
@@ -76,7 +78,6 @@ ScanSelector::ScanSelector(SelectorConfig config)
     checkNotNegative("max_time_difference_ns", camera.max_time_difference_ns, &problems);
     checkNotNegative("timeout_ns", camera.timeout_ns, &problems);
     checkNotNegative("reorder_window_ns", camera.reorder_window_ns, &problems);
-    constexpr StampNs kMaxOffsetNs = 1000000000 * kNsPerSecond;
     if (distance(camera.time_offset_ns, 0) > kMaxOffsetNs) {
       problems.push_back("time_offset_ns = " + std::to_string(camera.time_offset_ns) +
                          ": must be within 1e9 s");
@@ -141,6 +142,21 @@ void ScanSelector::addScan(const SelectorScan& scan, StampNs now_ns) {
   pending_.insert(later, std::move(pending));
   settleAll(now_ns, Waiting::kAsConfigured);
   makeRoom();
+}
+
+void ScanSelector::setTimeOffset(int camera, StampNs offset_ns) {
+  if (camera < 0 || camera >= static_cast<int>(cameras_.size()) ||
+      distance(offset_ns, 0) > kMaxOffsetNs) {
+    throw DataError("time offset " + std::to_string(offset_ns) + " ns of camera " +
+                    std::to_string(camera) + ": no such camera, or no such offset");
+  }
+  const auto index = static_cast<std::size_t>(camera);
+  const StampNs shift_ns = offset_ns - config_.cameras[index].time_offset_ns;
+  if (shift_ns == 0) return;
+  config_.cameras[index].time_offset_ns = offset_ns;
+  std::set<StampNs> shifted;
+  for (const StampNs image : cameras_[index].images) shifted.insert(image + shift_ns);
+  cameras_[index].images.swap(shifted);
 }
 
 void ScanSelector::addImage(int camera, StampNs stamp) {

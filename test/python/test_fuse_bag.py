@@ -212,10 +212,12 @@ def test_topics_types_and_stamps(room, fused):
         "/left/selection": "sensor_msgs/TimeReference",
         "/points_compensated": "sensor_msgs/PointCloud2",
         "/points_semantic": "sensor_msgs/PointCloud2",
+        "/tf": "tf2_msgs/TFMessage",
+        "/tf_static": "tf2_msgs/TFMessage",
     }
     assert fused.types == expected
     for topic, messages in fused.messages.items():
-        if topic not in ("/class_info", "/configuration"):
+        if topic not in ("/class_info", "/configuration", "/tf", "/tf_static"):
             assert [t for t, _ in messages] == [m.header.stamp.to_nsec() for _, m in messages]
             assert len(messages) == room.drive.scans
     for index, reference in enumerate(fused.of("/scan_reference")):
@@ -345,6 +347,8 @@ def test_rig_without_cameras(tmp_path):
         "/scan_reference",
         "/points_compensated",
         "/points_semantic",
+        "/tf",
+        "/tf_static",
     }
     for cloud in fused.clouds():
         assert len(cloud) == made.drive.points_per_scan
@@ -895,12 +899,27 @@ def test_interrupt_leaves_nothing(room, tmp_path, number):
     assert not leftovers(tmp_path)
 
 
-def test_copied_transforms(room):
-    fused = room.fuse("--tf", name="tf.bag")
+def test_copied_transforms(room, fused):
     assert len(fused.of("/tf_static")) == 1
     with rosbag.Bag(str(room.bag)) as bag:
         originals = [m for _, m, _ in bag.read_messages("/tf")]
     assert fused.of("/tf") == originals
+    without = room.fuse("--no-tf", name="without.bag")
+    assert set(fused.messages) - set(without.messages) == {"/tf", "/tf_static"}
+
+
+def test_transforms_of_other_names(room, fused, tmp_path):
+    """A robot in a namespace of its own, as its recorder names its topics."""
+    with rosbag.Bag(str(room.bag)) as old, rosbag.Bag(str(tmp_path / "ns.bag"), "w") as new:
+        for topic, message, time in old.read_messages():
+            new.write("/robot" + topic if topic.startswith("/tf") else topic, message, time)
+    settings = ["tf.topic=/robot/tf", "tf.static_topic=/robot/tf_static"]
+    options = [part for setting in settings for part in ("--set", setting)]
+    result = run(tmp_path / "ns.bag", tmp_path / "out.bag", "--rig", room.rig, *options)
+    assert result.returncode == 0, result.stderr
+    other = Fused(tmp_path / "out.bag", result)
+    assert [c.tobytes() for c in other.clouds()] == [c.tobytes() for c in fused.clouds()]
+    assert len(other.of("/tf_static")) == 1 and other.of("/tf") == fused.of("/tf")
 
 
 def rewritten(source, target, change, keep=lambda time: True):

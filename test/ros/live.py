@@ -292,18 +292,18 @@ class Feed:
             topic: rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
             for topic, kind in types.items()
         }
-        self._passes = 0
+        self.passes = 0
 
     def next_drive(self):
         """The drive's messages at the stamps of the next pass: (topic, message)."""
-        self._passes += 1
+        self.passes += 1
         result = []
         for _, topic, original in self._messages:
             message = copy.deepcopy(original)
             for stamped in getattr(message, "transforms", [message]):
-                stamped.header.stamp.secs += self._passes * self.SHIFT_S
+                stamped.header.stamp.secs += self.passes * self.SHIFT_S
             for packet in getattr(message, "packets", []):
-                packet.stamp.secs += self._passes * self.SHIFT_S
+                packet.stamp.secs += self.passes * self.SHIFT_S
             result.append((topic, message))
         return result
 

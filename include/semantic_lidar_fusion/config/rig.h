@@ -6,6 +6,7 @@
 /// file. The keys are documented in config/usyd.yaml; a key's name equals the field's.
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <memory>
 #include <optional>
@@ -41,6 +42,17 @@ struct LensFileConfig {
   std::shared_ptr<const LensCalibration> calibration;  ///< what the file holds; null without one
 };
 
+/// A correction of where tf puts a camera, as one finds it by eye: the camera is turned about the
+/// axes of the lidar (roll, then pitch, then yaw) and shifted along them.
+struct CameraNudge {
+  std::array<double, 3> deg{};  ///< about x, y, z
+  std::array<double, 3> m{};    ///< along x, y, z
+
+  bool operator==(const CameraNudge& other) const { return deg == other.deg && m == other.m; }
+  /// The corrected extrinsics; those given, bit by bit, without a correction.
+  Transform applied(const Transform& T_camera_lidar) const;
+};
+
 struct CameraConfig {
   std::string name;  ///< [A-Za-z][A-Za-z0-9_]*; output topics live in /<name>/
   std::string ns;    ///< key `namespace`: topics of the camera, e.g. /gmsl/A0; default: name
@@ -56,6 +68,7 @@ struct CameraConfig {
   RowBand lidar_rows;  ///< that the lidar's points can reach
   LensFileConfig lens;
   ShutterConfig shutter;
+  CameraNudge nudge;
   double time_offset_s = 0.0;           ///< key time_offset
   double max_time_difference_s = 0.05;  ///< key max_time_difference
   double timeout_s = 0.2;               ///< key timeout
@@ -148,6 +161,8 @@ struct Rig {
   LidarConfig lidar;
   std::string fixed_frame = "odom";
   std::string vehicle_frame = "base_link";
+  std::string tf_topic = "/tf";                ///< key tf.topic, of nodelets and input bags
+  std::string tf_static_topic = "/tf_static";  ///< key tf.static_topic
   SuperpixelConfig superpixels;
   UncertaintyConfig uncertainty;
   bool motion_enabled = true;                                         ///< key motion.enabled
@@ -166,6 +181,10 @@ struct Rig {
   /// Index of the reference camera; -1 without cameras.
   int referenceCamera() const;
   SelectorConfig selectorConfig() const;
+  /// Takes over from a rig of the same cameras what may change while it runs: occlusion,
+  /// uncertainty, smoothing, overlap, threads, and the cameras' time offsets and nudges. All else
+  /// stays, and so do the addresses of the cameras.
+  void retune(const Rig& other);
   CompensationConfig compensationConfig() const;
 };
 

@@ -61,6 +61,9 @@ class ScanPipeline {
   ScanPipeline(const Rig& rig, const PipelineSteps& steps);
   ~ScanPipeline();
 
+  /// Takes over what may change between two scans; see Rig::retune. No step runs meanwhile.
+  void retune(const Rig& rig);
+
   /// Superpixels and share of an image of camera `camera`, whose `image` and `input` are given
   /// (no `input`: the network makes scores). Images of one camera come in order of time, one at a
   /// time; different cameras may be segmented in parallel where no network is built. Throws

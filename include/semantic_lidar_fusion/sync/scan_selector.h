@@ -129,6 +129,9 @@ class ScanSelector {
   /// scans: `image_history_ns` is all that is kept. Throws DataError on an unknown camera or a
   /// stamp beyond kMaxStampNs.
   void addImage(int camera, StampNs stamp);
+  /// Another offset of a camera's clock from here on, also for the images that are known. Throws
+  /// DataError on an unknown camera or an offset that the constructor refuses.
+  void setTimeOffset(int camera, StampNs offset_ns);
   /// Settles what can be settled at `now_ns`; each decision comes once. To be called after every
   /// addition, and when a timeout may have passed.
   SelectorDecisions advance(StampNs now_ns);

@@ -29,7 +29,7 @@ CameraPlace CameraPlaces::at(std::size_t camera, const ros::Time& time,
   const std::string outcome = "camera " + rig_.cameras[camera].name + " sees nothing (status 2)";
   const std::optional<Transform> T_camera_lidar = extrinsics(frame, lidar_frame, outcome);
   if (!T_camera_lidar) return result;
-  result.T_camera_lidar = *T_camera_lidar;
+  result.T_camera_lidar = config.nudge.applied(*T_camera_lidar);
   result.model = model(camera, info);
   return result;
 }

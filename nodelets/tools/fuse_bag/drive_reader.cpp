@@ -218,7 +218,7 @@ class DriveReader::Router {
   }
 
   void addPoses() {
-    if (const BagInput::Topic* tf = input_.find("/tf")) {
+    if (const BagInput::Topic* tf = input_.find(rig_.tf_topic)) {
       handlers_[bareTopic(tf->name)].push_back(
           [this](const rosbag::MessageInstance& m) { addTransforms(m, false); });
     }
@@ -305,7 +305,7 @@ DriveReader::DriveReader(const BagInput& input, const Rig& rig, const ReadingWin
 DriveReader::~DriveReader() = default;
 
 void DriveReader::readStatics() {
-  const BagInput::Topic* tf_static = input_.find("/tf_static");
+  const BagInput::Topic* tf_static = input_.find(rig_.tf_static_topic);
   if (tf_static == nullptr) return;
   rosbag::View statics;
   input_.addTo({tf_static->name}, &statics);

@@ -24,15 +24,15 @@ as fast as the machine allows. The same input gives the same bytes.
   IN.bag           lidar, camera_info, tf (or odometry), images and scores; several bags are one
                    drive (rosbag record --split, images or tf_static apart)
   OUT.bag          /scan_reference, /points_compensated, /points_semantic, /class_info,
-                   /configuration (the rig as used) and for each camera /<camera>/selection,
-                   LZ4-compressed
+                   /configuration (the rig as used), /tf, /tf_static and for each camera
+                   /<camera>/selection, LZ4-compressed
 
 options:
   --rig FILE       the rig file (see config/usyd.yaml)
   --set KEY=VALUE  override a key of the rig file, e.g. --set occlusion.mode=paper; repeatable
   --all            also write for each camera superpixels, share, probabilities, scores (where the
                    package's own network made them), projection_overlay and uncertainty_overlay
-  --tf             also copy /tf and /tf_static to OUT.bag
+  --no-tf          leave out /tf and /tf_static, without which OUT.bag shows and maps by itself
   --truth visibility
                    let the bag's /points_truth, and no mask, say which camera sees which point
   --also OUT2.bag  make a second output, and so on: the options --set and --truth behind it are its
@@ -80,9 +80,12 @@ FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
   reader.wholeNumber("--jobs", 1, kMostJobs, &options.jobs);
   reader.flag("--uncompressed", &options.uncompressed);
   reader.flag("--all", &options.all);
-  reader.flag("--tf", &options.tf);
+  bool without_tf = false;
+  reader.flag("--no-tf", &without_tf);
+  reader.flag("--tf", &options.tf);  // the default
   reader.flag("--print-rig", &options.print_rig);
   std::vector<std::string> files = reader.read(arguments);
+  options.tf = !without_tf;
   if (options.help || options.version) return options;
   if (options.rig.empty() && (options.print_rig || files.size() >= 2)) {
     throw UsageError("--rig FILE is wanted");

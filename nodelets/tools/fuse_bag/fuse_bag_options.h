@@ -26,7 +26,7 @@ struct FuseBagOptions : CommonOptions {
   std::optional<double> end_s;  ///< the same; empty: to the last one
   bool uncompressed = false;
   bool all = false;
-  bool tf = false;
+  bool tf = true;
   bool print_rig = false;
 };
 

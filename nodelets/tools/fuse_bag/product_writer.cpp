@@ -81,7 +81,7 @@ void ProductWriter::copyTransforms(const std::vector<rosbag::MessageInstance>& t
     const auto value = message.instantiate<tf2_msgs::TFMessage>();
     if (!value) continue;
     const StampNs time = stampNs(message.getTime());
-    if (bareTopic(message.getTopic()) == "tf_static") {
+    if (bareTopic(message.getTopic()) == bareTopic(rig_.tf_static_topic)) {
       output_.writeLatched("/tf_static", time, *value);
     } else {
       output_.write("/tf", time, *value);

@@ -414,6 +414,8 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
             "left"},
            {"[{name: A0, shutter: {stamp_row: 5}}]",
             "rig.yaml: cameras.A0.shutter.stamp_row = 5: must be one of first, middle, last"},
+           {"[{name: A0, nudge: {deg: [1, 2]}}]", "rig.yaml: cameras.A0.nudge.deg"},
+           {"[{name: A0, nudge: {m: [0, 0, 11]}}]", "rig.yaml: cameras.A0.nudge.m"},
            {"[{name: A0, time_offset: 1e10}]", "rig.yaml: cameras.A0.time_offset = 1e10: must be"},
            {"[{name: A0, max_time_difference: -1}]", "rig.yaml: cameras.A0.max_time_difference ="},
            {"[{name: A0, timeout: 0}]", "rig.yaml: cameras.A0.timeout = 0: must be a number above"},
@@ -427,6 +429,40 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
     const std::string problem = problemOf(cameras + bad.text);
     EXPECT_EQ(problem.find(bad.problem), 0u) << bad.text << "\n" << problem;
   }
+}
+
+TEST(RigTest, ANudgeTurnsAndShiftsTheCameraInTheLidarsAxes) {
+  const Rig rig = parse(
+      "classes: classes_usyd12.yaml\ncameras: [{name: a, nudge: {deg: [0, 0, 90], m: [1, 2, 3]}}]");
+  // A camera at (5, 0, 0) that looks along the lidar's x: its z axis.
+  Transform T_lidar_camera = Transform::Identity();
+  T_lidar_camera.linear() << 0, 0, 1, -1, 0, 0, 0, -1, 0;
+  T_lidar_camera.translation() << 5, 0, 0;
+  const Transform nudged =
+      rig.cameras[0].nudge.applied(T_lidar_camera.inverse(Eigen::Isometry)).inverse();
+  EXPECT_TRUE(nudged.translation().isApprox(Eigen::Vector3d(6, 2, 3)));
+  EXPECT_TRUE((nudged.linear() * Eigen::Vector3d::UnitZ()).isApprox(Eigen::Vector3d::UnitY()));
+  EXPECT_TRUE((nudged.linear() * Eigen::Vector3d::UnitY()).isApprox(-Eigen::Vector3d::UnitZ()));
+  EXPECT_EQ(rigFromYaml(parseYaml(rig.yaml, "x"), "/nowhere", "x.yaml").yaml, rig.yaml);
+  EXPECT_TRUE(CameraNudge{}.applied(T_lidar_camera).matrix() == T_lidar_camera.matrix());
+}
+
+TEST(RigTest, RetuningTakesOverWhatMayChangeAlone) {
+  const std::string cameras = "classes: classes_usyd12.yaml\ncameras: [{name: a";
+  Rig rig = parse(cameras + "}]");
+  const CameraConfig* camera = rig.cameras.data();
+  const Rig other = parse(cameras +
+                          ", time_offset: 0.5, timeout: 1, nudge: {m: [1, 0, 0]}}]\nthreads: 3\n"
+                          "occlusion: {mode: paper}\noverlap: product\nfixed_frame: map");
+  rig.retune(other);
+  EXPECT_EQ(rig.cameras.data(), camera);
+  EXPECT_EQ(rig.cameras[0].time_offset_s, 0.5);
+  EXPECT_EQ(rig.cameras[0].nudge, other.cameras[0].nudge);
+  EXPECT_EQ(rig.cameras[0].timeout_s, 0.2);
+  EXPECT_EQ(rig.occlusion.mode, &OcclusionMode::kPaper);
+  EXPECT_EQ(rig.overlap, OverlapRule::kProduct);
+  EXPECT_EQ(rig.threads, 3);
+  EXPECT_EQ(rig.fixed_frame, "odom");
 }
 
 TEST(RigTest, ReadsLensFilesAndShutters) {

@@ -127,6 +127,19 @@ TEST(ScanSelectorTest, TrueTimeIsStampPlusOffsetAndImagesAreNamedByRawStamp) {
             "scan 0 camera 1 image 45000000\n");
 }
 
+TEST(ScanSelectorTest, AnotherTimeOffsetHoldsForImagesThatAreKnown) {
+  ScanSelector selector(cameras(1));
+  selector.addImage(0, kStart + 40 * kMs);
+  selector.addImage(0, kStart + 60 * kMs);
+  selector.setTimeOffset(0, -9 * kMs);
+  selector.addScan(scanAt(kStart), 0);
+  // The middle is at 50 ms: the images were taken at 31 and 51 ms.
+  EXPECT_EQ(describe(selector.advance(0)),
+            "scan 0 t_ref 51000000\nscan 0 camera 0 image 60000000\n");
+  EXPECT_THROW(selector.setTimeOffset(1, 0), DataError);
+  EXPECT_THROW(selector.setTimeOffset(0, StampNs{1} << 62), DataError);
+}
+
 TEST(ScanSelectorTest, NothingWithinTheLimitIsNone) {
   SelectorConfig config = cameras(2);
   ScanSelector selector(config);
