@@ -64,8 +64,8 @@ class EpochMonitor {
                std::function<void(const DiscardedMessage&)> discarded);
 
   /// A message of `source` (a name for messages that come in one order, e.g. the topic) with its
-  /// true time. `work` uses it and does not throw: it runs now, later, or never. `tolerance_ns`: how
-  /// far the true time of a message of the lead may be off `stamp`.
+  /// true time. `work` uses it and does not throw: it runs now, later, or never. `tolerance_ns`:
+  /// how far the true time of a message of the lead may be off `stamp`.
   void observe(const std::string& source, StampNs stamp, Work work, StampNs tolerance_ns = 0);
 
   std::size_t held() const { return held_.size(); }

@@ -66,8 +66,8 @@ class FusionQueue {
   void addSelection(StampNs key_ns, int camera, std::optional<StampNs> image_stamp, StampNs now_ns);
   /// The semantics of an image are at hand (or will never be).
   void setSemantics(int camera, StampNs image_stamp, bool ready);
-  /// Clouds come in the order of their scans; one that does not is dropped and counted. The stamp of
-  /// a cloud without points is its header's and tells no order.
+  /// Clouds come in the order of their scans; one that does not is dropped and counted. The stamp
+  /// of a cloud without points is its header's and tells no order.
   void addCloud(std::shared_ptr<const Cloud> cloud, StampNs now_ns);
 
   /// Scans that are complete at `now_ns`, in order.
