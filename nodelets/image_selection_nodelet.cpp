@@ -172,22 +172,27 @@ class ImageSelectionNodelet : public FusionNodelet {
   template <class M>
   void onScan(const boost::shared_ptr<const M>& message) {
     SelectorScan scan;
+    bool empty = false;
+    StampNs tolerance_ns = 0;
     {
       const StageTimer timer(health(), "decode");
       const TimedCloud cloud = lidar_->decode(*message);
-      if (cloud.empty()) {
+      scan.interval = scanInterval(cloud);
+      if (!isStamped(rig().lidar.topic, scan.interval.first_ns)) return;
+      empty = cloud.empty();
+      tolerance_ns = timeTolerance(cloud);
+      if (!empty) lookAtArrival(rig().lidar.topic, cloud.header_stamp);
+      if (sweep_ && !empty) scan.sweep_ns = sweepTimes(cloud);
+    }
+    const auto use = [this, scan, empty] {
+      if (empty) {  // nothing to choose images for; it tells where the lidar's time is
         health().count("empty scans");
         return;
       }
-      scan.interval = scanInterval(cloud);
-      if (!isStamped(rig().lidar.topic, scan.interval.first_ns)) return;
-      lookAtArrival(rig().lidar.topic, cloud.header_stamp);
-      if (sweep_) scan.sweep_ns = sweepTimes(cloud);
-    }
-    admit(epochs_.get(), rig().lidar.topic, scan.interval.first_ns, [this, scan] {
       selector_->addScan(scan, now());
       decide();
-    });
+    };
+    admit(epochs_.get(), rig().lidar.topic, scan.interval.first_ns, use, tolerance_ns);
   }
 
   std::vector<std::optional<StampNs>> sweepTimes(const TimedCloud& cloud) {

@@ -96,20 +96,23 @@ class MotionCompensationNodelet : public FusionNodelet {
       health().count("dropped: scan of stamp 0");
       return;
     }
-    if (scan->cloud.empty()) {  // its stamp is that of the header, which is no measured time
-      enqueue(std::move(*scan));
+    admit(
+        epochs_.get(), rig().lidar.topic, scan->interval.first_ns,
+        [this, scan] { onAdmitted(std::move(*scan)); }, timeTolerance(scan->cloud));
+  }
+
+  void onAdmitted(Scan scan) {
+    StampNs& last_ns = scan.cloud.empty() ? last_empty_ns_ : last_first_ns_;
+    if (scan.interval.first_ns == last_ns) {
+      health().count("dropped: scan of a known stamp");
       return;
     }
-    admit(epochs_.get(), rig().lidar.topic, scan->interval.first_ns, [this, scan] {
-      if (scan->interval.first_ns == last_first_ns_) {
-        health().count("dropped: scan of a known stamp");
-        return;
-      }
-      last_first_ns_ = scan->interval.first_ns;
-      room_.observe(last_first_ns_);
+    last_ns = scan.interval.first_ns;
+    if (!scan.cloud.empty()) {
+      room_.observe(last_ns);
       references_.grow(2 * room_.capacity());
-      enqueue(std::move(*scan));
-    });
+    }
+    enqueue(std::move(scan));
   }
 
   void enqueue(Scan scan) {
@@ -161,7 +164,7 @@ class MotionCompensationNodelet : public FusionNodelet {
     health().count("dropped: scan pending at a clock jump", pending_.size());
     pending_.clear();
     references_.clear();
-    last_first_ns_ = 0;
+    last_first_ns_ = last_empty_ns_ = 0;
   }
 
   /// Publishes the scans at the front of the queue that need not wait any longer.
@@ -232,6 +235,7 @@ class MotionCompensationNodelet : public FusionNodelet {
   std::unique_ptr<TfSubscription> tf_;
   std::unique_ptr<EpochMonitor> epochs_;
   StampNs last_first_ns_ = 0;  ///< of the last scan with points
+  StampNs last_empty_ns_ = 0;  ///< of the last scan without
   StampedStore<Reference> references_{kKnownReferences};
   std::deque<Scan> pending_;
   WaitingRoom room_{0};

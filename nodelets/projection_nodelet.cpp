@@ -191,19 +191,24 @@ class ProjectionNodelet : public FusionNodelet {
 
   void onCloud(const sensor_msgs::PointCloud2ConstPtr& message) {
     const auto cloud = std::make_shared<const Cloud>(compensatedCloud(*message));
-    admit(epochs_.get(), "points_compensated", cloud->stamp, [this, cloud] {
-      const FusionQueueCounters before = queue_->counters();
-      queue_->addCloud(cloud, now());
-      const FusionQueueCounters& after = queue_->counters();
-      health().count("dropped: scan behind the last one, or known",
-                     after.out_of_order - before.out_of_order);
-      if (after.overflow > before.overflow) {
-        health().count("dropped: scan, too many wait for cameras",
-                       after.overflow - before.overflow);
-        warn("pending", "a scan is dropped: too many others wait for cameras");
-      }
-      fuseComplete();
-    });
+    if (cloud->empty()) {  // has no scan_reference that would tell its epoch, and needs none
+      addCloud(cloud);
+      return;
+    }
+    admit(epochs_.get(), "points_compensated", cloud->stamp, [this, cloud] { addCloud(cloud); });
+  }
+
+  void addCloud(const std::shared_ptr<const Cloud>& cloud) {
+    const FusionQueueCounters before = queue_->counters();
+    queue_->addCloud(cloud, now());
+    const FusionQueueCounters& after = queue_->counters();
+    health().count("dropped: scan behind the last one, or known",
+                   after.out_of_order - before.out_of_order);
+    if (after.overflow > before.overflow) {
+      health().count("dropped: scan, too many wait for cameras", after.overflow - before.overflow);
+      warn("pending", "a scan is dropped: too many others wait for cameras");
+    }
+    fuseComplete();
   }
 
   void onScores(Camera* camera, const sensor_msgs::ImageConstPtr& message) {
@@ -293,7 +298,8 @@ class ProjectionNodelet : public FusionNodelet {
     std::vector<CameraView> views;
     for (const auto& camera : cameras_) {
       const auto index = static_cast<std::size_t>(camera->index);
-      const std::optional<SegmentedImage> image = imageOf(*camera, scan.views[index]);
+      const std::optional<SegmentedImage> image =
+          cloud.empty() ? std::nullopt : imageOf(*camera, scan.views[index]);
       views.push_back(pipeline_->view(index, place(*camera, cloud.frame_id),
                                       image ? &*image : nullptr, cloud.stamp,
                                       tf_->source().odometry(), T_vehicle_lidar.transform));

@@ -243,8 +243,13 @@ std::unique_ptr<EpochMonitor> FusionNodelet::watchedEpochs(const EpochConfig& co
 }
 
 void FusionNodelet::admit(EpochMonitor* epochs, const std::string& source, StampNs true_ns,
-                          const std::function<void()>& work) {
-  epochs->observe(source, true_ns, [this, source, work] { guard(source, work); });
+                          const std::function<void()>& work, StampNs tolerance_ns) {
+  const auto guarded = [this, source, work] { guard(source, work); };
+  epochs->observe(source, true_ns, guarded, tolerance_ns);
+}
+
+StampNs FusionNodelet::timeTolerance(const TimedCloud& scan) const {
+  return scan.empty() ? toNs(rig_.lidar.longest_scan_s) : 0;
 }
 
 void FusionNodelet::reportOverflow(const std::string& topic) {

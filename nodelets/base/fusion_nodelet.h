@@ -26,6 +26,7 @@
 #include "base/silence_watchdog.h"
 #include "base/topic_connections.h"
 #include "semantic_lidar_fusion/check/rig_watch.h"
+#include "semantic_lidar_fusion/common/point_cloud.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
@@ -117,7 +118,10 @@ class FusionNodelet : public nodelet::Nodelet {
                                               const std::function<void()>& forget);
   /// Hands a message to the monitor; `work` runs guarded, at once or when its epoch is clear.
   void admit(EpochMonitor* epochs, const std::string& source, StampNs true_ns,
-             const std::function<void()>& work);
+             const std::function<void()>& work, StampNs tolerance_ns = 0);
+  /// How far a scan's time may be off: one without points has its header's, which drivers set to
+  /// any time of the scan.
+  StampNs timeTolerance(const TimedCloud& scan) const;
 
   /// Reports at once, then at most every 30 s for the same `key`.
   void warn(const std::string& key, const std::string& text);

@@ -46,6 +46,17 @@ std::vector<std::string> overrideList(XmlRpcValue value, const std::string& key)
   return result;
 }
 
+/// Parameters outlive the launch that set them: a file of an earlier one hides a tree of today's.
+std::string hiddenTree(const ros::NodeHandle& node) {
+  std::string file_key, tree_key;
+  const XmlRpcValue file = searched(node, "rig_file", &file_key);
+  const bool has_file =
+      file.valid() && (file.getType() != XmlRpcValue::TypeString || !text(file, file_key).empty());
+  if (!has_file || !searched(node, "rig", &tree_key).valid()) return {};
+  return "parameter " + file_key + " counts, and parameter " + tree_key +
+         " is not read: is one of them of an earlier launch? rosparam delete it";
+}
+
 }  // namespace
 
 YAML::Node yamlTree(XmlRpcValue value, const std::string& key) {
@@ -108,6 +119,8 @@ std::vector<std::string> unknownParameters(const ros::NodeHandle& node) {
                                                   "overrides",     "camera", "diagnostic_period",
                                                   "tuned_rig_file"};
   std::vector<std::string> names, problems;
+  const std::string hidden = hiddenTree(node);
+  if (!hidden.empty()) problems.push_back(hidden);
   node.getParamNames(names);
   const std::string prefix = node.getNamespace() + "/";
   std::set<std::string> seen;

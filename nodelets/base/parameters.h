@@ -27,7 +27,7 @@ YAML::Node yamlTree(XmlRpc::XmlRpcValue value, const std::string& key);
 Rig loadRigFromParameters(const ros::NodeHandle& node);
 
 /// One line for each parameter in the node's namespace that nothing reads, with the name that it
-/// may have been meant for.
+/// may have been meant for, and for a rig tree that a rig file hides.
 std::vector<std::string> unknownParameters(const ros::NodeHandle& node);
 
 }  // namespace semantic_lidar_fusion

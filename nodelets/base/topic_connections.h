@@ -13,6 +13,8 @@
 #include "base/demand.h"
 #include "base/health.h"
 #include "base/inbox.h"
+#include "edge/declared_lengths.h"
+#include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {
 
@@ -63,8 +65,10 @@ class TopicConnections {
         inbox->add(message);
       });
     };
-    return transport.subscribe<M>(resolved, kTransportQueue, store, ros::VoidConstPtr(),
-                                  ros::TransportHints().tcpNoDelay());
+    const auto damaged = [this, gate = gate_, resolved](const std::string& reason) {
+      gate->pass([&] { guard_(resolved, [&] { throw DataError(reason); }); });
+    };
+    return subscribeChecked<M>(transport, resolved, kTransportQueue, store, damaged);
   }
 
   /// Ends a subscription, if it is one; what it waited for is no longer missed.

@@ -266,6 +266,12 @@ cv::Mat decodedImage(const sensor_msgs::CompressedImage& message) {
     throw DataError("compressed image of format '" + message.format + "', " +
                     std::to_string(message.data.size()) + " bytes: the JPEG ends too early");
   }
+  const std::optional<ImageSize> size = encodedSize(message.data);
+  if (size && std::int64_t{size->width} * size->height > kMostPixels) {
+    throw DataError("compressed image of format '" + message.format + "' is " +
+                    std::to_string(size->width) + " x " + std::to_string(size->height) +
+                    " pixels; at most " + std::to_string(kMostPixels) + " are decoded");
+  }
   cv::Mat image = decodedJpeg(message.data);
   if (!image.empty()) return demosaiced(image, message.format);
   try {
@@ -406,6 +412,13 @@ std_msgs::String classInfoMessage(const LabelSet& classes) {
   std_msgs::String message;
   message.data = classes.toJson();
   return message;
+}
+
+std::string normNote(const geometry_msgs::Quaternion& rotation) {
+  const double norm = Eigen::Quaterniond(rotation.w, rotation.x, rotation.y, rotation.z).norm();
+  if (std::abs(norm - 1.0) <= kRoundedNorm) return {};
+  return "has a quaternion of norm " + std::to_string(norm) +
+         "; 1 is wanted: it is taken as if normalised. Which filter does not normalise?";
 }
 
 Transform transform(const geometry_msgs::Transform& message) {

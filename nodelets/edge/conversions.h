@@ -82,7 +82,10 @@ std_msgs::String classInfoMessage(const LabelSet& classes);
 
 // --- Poses
 
-/// Throws DataError if a number is not finite or the quaternion's norm is further than 1e-2 from 1.
+/// What to tell of a rotation that is taken though its norm is not 1 (kRoundedNorm); mostly
+/// nothing.
+std::string normNote(const geometry_msgs::Quaternion& rotation);
+/// Throws DataError if a number is not finite or the quaternion is no rotation.
 Transform transform(const geometry_msgs::Transform& message);
 Transform transform(const geometry_msgs::Pose& message);
 

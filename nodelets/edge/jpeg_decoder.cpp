@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: MIT
 #include "edge/jpeg_decoder.h"
 
+#include <algorithm>
+#include <cstdlib>
+
 #ifdef SLF_HAVE_TURBOJPEG
 #include <turbojpeg.h>
 
@@ -8,11 +11,66 @@
 #endif
 
 namespace semantic_lidar_fusion {
+namespace {
+
+using Data = std::vector<std::uint8_t>;
+
+bool startsWith(const Data& data, const std::initializer_list<std::uint8_t>& start) {
+  return data.size() >= start.size() && std::equal(start.begin(), start.end(), data.begin());
+}
+
+/// `bytes` bytes from `at` on, the most significant first.
+std::int64_t bigEndian(const Data& data, std::size_t at, int bytes) {
+  std::int64_t value = 0;
+  for (int i = 0; i < bytes; ++i) value = value << 8 | data[at + static_cast<std::size_t>(i)];
+  return value;
+}
+
+std::int64_t littleEndian(const Data& data, std::size_t at) {
+  return std::int64_t{data[at]} | std::int64_t{data[at + 1]} << 8 |
+         std::int64_t{data[at + 2]} << 16 | std::int64_t{data[at + 3]} << 24;
+}
+
+/// Declared sizes reach 2^32; the package's are int.
+ImageSize imageSize(std::int64_t width, std::int64_t height) {
+  constexpr std::int64_t kMost = 1 << 30;
+  return {static_cast<int>(std::min(width, kMost)), static_cast<int>(std::min(height, kMost))};
+}
+
+/// From the first frame header.
+std::optional<ImageSize> jpegSize(const Data& data) {
+  for (std::size_t at = 2; at + 9 < data.size();) {
+    if (data[at] != 0xFF) return std::nullopt;
+    const std::uint8_t marker = data[at + 1];
+    if (marker == 0xFF) {  // fill byte
+      ++at;
+      continue;
+    }
+    const bool is_frame =
+        marker >= 0xC0 && marker <= 0xCF && marker != 0xC4 && marker != 0xC8 && marker != 0xCC;
+    if (is_frame) return imageSize(bigEndian(data, at + 7, 2), bigEndian(data, at + 5, 2));
+    at += 2 + static_cast<std::size_t>(bigEndian(data, at + 2, 2));
+  }
+  return std::nullopt;
+}
+
+}  // namespace
+
+std::optional<ImageSize> encodedSize(const std::vector<std::uint8_t>& data) {
+  if (startsWith(data, {0xFF, 0xD8})) return jpegSize(data);
+  if (startsWith(data, {0x89, 'P', 'N', 'G'}) && data.size() >= 24) {
+    return imageSize(bigEndian(data, 16, 4), bigEndian(data, 20, 4));
+  }
+  if (startsWith(data, {'B', 'M'}) && data.size() >= 26) {
+    const auto height = static_cast<std::int32_t>(littleEndian(data, 22));  // negative: top down
+    return imageSize(littleEndian(data, 18), std::abs(std::int64_t{height}));
+  }
+  return std::nullopt;
+}
 
 #ifdef SLF_HAVE_TURBOJPEG
 
 cv::Mat decodedJpeg(const std::vector<std::uint8_t>& data) {
-  constexpr std::int64_t kMostPixels = 1 << 26;  // of any camera; no header allocates more here
   if (data.size() < 2 || data[0] != 0xFF || data[1] != 0xD8) return {};
   const std::unique_ptr<void, int (*)(tjhandle)> decoder(tjInitDecompress(), tjDestroy);
   const auto length = static_cast<unsigned long>(data.size());

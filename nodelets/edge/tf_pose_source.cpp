@@ -27,6 +27,14 @@ constexpr std::size_t kMaxDepth = 1000;
 /// this (two clocks, a bag from its end) is kept and looked up here.
 constexpr StampNs kOrderlyNs = 5 * kNsPerSecond;
 constexpr std::size_t kMostNotes = 100;
+/// Frames that move, besides those that are asked for: a node that invents names must not fill the
+/// memory, and frames that are forgotten come again with their next transform.
+constexpr std::size_t kMostMoving = 1000;
+/// Static frames come once and are kept. Vehicles have some hundred.
+constexpr std::size_t kMostStatic = 10000;
+/// Frames asked for that are remembered; messages can name any.
+constexpr std::size_t kMostAsked = 200;
+constexpr std::size_t kLongestFrame = 256;
 
 std::string seconds(StampNs stamp) {
   char text[40];
@@ -48,6 +56,25 @@ std::string valueText(const Transform& T) {
 bool differ(const Transform& a, const Transform& b) {
   return (a.translation() - b.translation()).norm() > 1e-3 ||
          Eigen::Quaterniond(a.linear()).angularDistance(Eigen::Quaterniond(b.linear())) > 1e-3;
+}
+
+geometry_msgs::TransformStamped stampedTransform(const std::string& parent,
+                                                 const std::string& child, StampNs stamp,
+                                                 const Transform& T_parent_child) {
+  geometry_msgs::TransformStamped message;
+  message.header.frame_id = parent;
+  message.header.stamp = rosTime(stamp);
+  message.child_frame_id = child;
+  const Eigen::Vector3d p = T_parent_child.translation();
+  const Eigen::Quaterniond q(T_parent_child.linear());
+  message.transform.translation.x = p.x();
+  message.transform.translation.y = p.y();
+  message.transform.translation.z = p.z();
+  message.transform.rotation.w = q.w();
+  message.transform.rotation.x = q.x();
+  message.transform.rotation.y = q.y();
+  message.transform.rotation.z = q.z();
+  return message;
 }
 
 void checkPlace(const Eigen::Vector3d& translation, double largest_m) {
@@ -96,6 +123,7 @@ TfPoseSource::TfPoseSource(TfPoseSourceConfig config)
       odometry_(config_.history_ns, config_.fastest_mps) {
   config_.fixed_frame = frameName(config_.fixed_frame);
   config_.vehicle_frame = frameName(config_.vehicle_frame);
+  asked_ = {config_.fixed_frame, config_.vehicle_frame};
 }
 
 bool TfPoseSource::refuse(const std::string& child, const std::string& what,
@@ -162,6 +190,8 @@ bool TfPoseSource::add(const geometry_msgs::TransformStamped& message, bool is_s
   try {
     T_parent_child = transform(message.transform);
     checkPlace(T_parent_child.translation(), config_.largest_coordinate_m);
+    const std::string off = normNote(message.transform.rotation);
+    if (!off.empty()) note("norm " + child, name + " " + off);
     const Eigen::Quaterniond rotation(T_parent_child.linear());
     clean.transform.rotation.w = rotation.w();
     clean.transform.rotation.x = rotation.x();
@@ -169,6 +199,12 @@ bool TfPoseSource::add(const geometry_msgs::TransformStamped& message, bool is_s
     clean.transform.rotation.z = rotation.z();
   } catch (const DataError& e) {
     return refuse(child, name, e.what());
+  }
+  for (const std::string& frame : {parent, child}) {
+    if (frame.size() <= kLongestFrame) continue;
+    return refuse("long name", "transform",
+                  "a frame's name of " + std::to_string(frame.size()) + " bytes; at most " +
+                      std::to_string(kLongestFrame) + " are taken");
   }
   if (parent.empty()) return refuse(child, name, "header.frame_id is empty");
   if (child.empty()) return refuse(child, name, "child_frame_id is empty");
@@ -186,6 +222,11 @@ bool TfPoseSource::add(const geometry_msgs::TransformStamped& message, bool is_s
   if (known != edges_.end() && !is_static && stamp == known->second.newest) {
     ++counters_.repeated;
     return false;
+  }
+  if (known == edges_.end() && !hasRoom(is_static)) {
+    return refuse("frames", name,
+                  "there are " + std::to_string(kMostStatic) +
+                      " static frames already; which node invents names?");
   }
   const bool late =
       known != edges_.end() && !is_static && stamp + kOrderlyNs < known->second.newest;
@@ -237,6 +278,8 @@ bool TfPoseSource::add(const nav_msgs::Odometry& message) {
   try {
     T_fixed_body = transform(message.pose.pose);
     checkPlace(T_fixed_body.translation(), config_.largest_coordinate_m);
+    const std::string off = normNote(message.pose.pose.orientation);
+    if (!off.empty()) note("norm", name + " " + off);
   } catch (const DataError& e) {
     return refuse("odometry", name, e.what());
   }
@@ -262,6 +305,45 @@ void TfPoseSource::noteTwist(const nav_msgs::Odometry& message, const Transform&
   if (doubt) note("twist", *doubt);
 }
 
+/// Makes room for a frame that is new; false if there is none.
+bool TfPoseSource::hasRoom(bool is_static) {
+  const auto count = std::count_if(edges_.begin(), edges_.end(), [&](const auto& edge) {
+    return edge.second.is_static == is_static;
+  });
+  if (is_static) return static_cast<std::size_t>(count) < kMostStatic;
+  if (static_cast<std::size_t>(count) >= kMostMoving) forgetMoving();
+  return true;
+}
+
+/// Keeps of the frames that move those between frames that are asked for. tf2 forgets no name: it
+/// is set up anew.
+void TfPoseSource::forgetMoving() {
+  std::set<std::string> kept;
+  for (const std::string& frame : asked_) {
+    for (const std::string& above : ancestors(frame)) kept.insert(above);
+  }
+  std::size_t forgotten = 0;
+  for (auto edge = edges_.begin(); edge != edges_.end();) {
+    const bool keep = edge->second.is_static || kept.count(edge->first) > 0;
+    forgotten += keep ? 0 : 1;
+    edge = keep ? std::next(edge) : edges_.erase(edge);
+  }
+  note("frames", std::to_string(forgotten) +
+                     " frames that move and that nobody asks for are forgotten: which node invents "
+                     "names?");
+  buffer_ = std::make_unique<tf2::BufferCore>(cacheLength(config_.history_ns));
+  for (const auto& [child, edge] : edges_) {
+    if (edge.is_static || edge.poses.empty()) {
+      buffer_->setTransform(stampedTransform(edge.parent, child, edge.newest, edge.latest), "",
+                            edge.is_static);
+    }
+    for (const auto& [stamp, pose] : edge.poses) {
+      if (stamp + kOrderlyNs < edge.newest) continue;
+      buffer_->setTransform(stampedTransform(edge.parent, child, stamp, pose), "", false);
+    }
+  }
+}
+
 void TfPoseSource::clear() {
   buffer_->clear();  // static transforms survive
   for (auto& edge : edges_) {
@@ -280,6 +362,8 @@ void TfPoseSource::clear() {
 
 TransformAnswer TfPoseSource::extrinsics(const std::string& target,
                                          const std::string& source) const {
+  if (asked_.size() >= kMostAsked) asked_ = {config_.fixed_frame, config_.vehicle_frame};
+  asked_.insert({frameName(target), frameName(source)});
   noteChangingExtrinsics(frameName(target), frameName(source));
   return lookup(frameName(target), frameName(source), ros::Time(0));
 }

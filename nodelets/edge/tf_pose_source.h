@@ -124,6 +124,8 @@ class TfPoseSource {
   std::string jumpText(StampNs stamp) const;
   void addReading(const StampedPose& reading);
   void noteTwist(const nav_msgs::Odometry& message, const Transform& T_fixed_body);
+  bool hasRoom(bool is_static);
+  void forgetMoving();
   bool findMovingEdges();
   void readTf();
   void readPendingOdometry();
@@ -140,6 +142,7 @@ class TfPoseSource {
   PoseBuffer odometry_;
   std::vector<StampedPose> late_;  ///< readings before the newest, to be sorted in
   std::string problem_;
+  mutable std::set<std::string> asked_;     ///< frames that a transform was asked for
   mutable std::set<std::string> noted_;     ///< keys of what was told
   mutable std::vector<std::string> notes_;  ///< that were not taken
   TwistWatch twist_watch_;

@@ -9,7 +9,9 @@
 #include <string>
 
 #include "edge/conversions.h"
+#include "edge/declared_lengths.h"
 #include "edge/tf_pose_source.h"
+#include "semantic_lidar_fusion/common/plain_text.h"
 #include "semantic_lidar_fusion/config/rig.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 
@@ -29,26 +31,23 @@ class TfSubscription {
 
   TfSubscription(ros::NodeHandle& handle, const Rig& rig)
       : source_(tfPoseSourceConfig(rig, kHistoryNs)) {
-    const auto hints = ros::TransportHints().tcpNoDelay();
-    static_ = handle.subscribe<tf2_msgs::TFMessage>(
-        rig.tf_static_topic, kQueue,
-        boost::function<void(const tf2_msgs::TFMessageConstPtr&)>(
-            [this](const tf2_msgs::TFMessageConstPtr& message) { add(*message, true); }),
-        ros::VoidConstPtr(), hints);
-    moving_ = handle.subscribe<tf2_msgs::TFMessage>(
-        rig.tf_topic, kQueue,
-        boost::function<void(const tf2_msgs::TFMessageConstPtr&)>(
-            [this](const tf2_msgs::TFMessageConstPtr& message) { add(*message, false); }),
-        ros::VoidConstPtr(), hints);
+    const auto damaged = [](const std::string& reason) {
+      ROS_WARN_STREAM_THROTTLE(30.0, "tf: " << plainText(reason));
+    };
+    static_ = subscribeChecked<tf2_msgs::TFMessage>(
+        handle, rig.tf_static_topic, kQueue,
+        [this](const tf2_msgs::TFMessageConstPtr& message) { add(*message, true); }, damaged);
+    moving_ = subscribeChecked<tf2_msgs::TFMessage>(
+        handle, rig.tf_topic, kQueue,
+        [this](const tf2_msgs::TFMessageConstPtr& message) { add(*message, false); }, damaged);
     if (rig.odometry.source == OdometrySource::kTopic) {
-      odometry_ = handle.subscribe<nav_msgs::Odometry>(
-          rig.odometry.topic, kQueue,
-          boost::function<void(const nav_msgs::OdometryConstPtr&)>(
-              [this](const nav_msgs::OdometryConstPtr& message) {
-                observe(message->header.stamp, [this, message] { source_.add(*message); });
-                reportNotes();
-              }),
-          ros::VoidConstPtr(), hints);
+      odometry_ = subscribeChecked<nav_msgs::Odometry>(
+          handle, rig.odometry.topic, kQueue,
+          [this](const nav_msgs::OdometryConstPtr& message) {
+            observe(message->header.stamp, [this, message] { source_.add(*message); });
+            reportNotes();
+          },
+          damaged);
     }
   }
 
@@ -57,7 +56,10 @@ class TfSubscription {
  private:
   /// What is said of transforms and odometry, each line once.
   void reportNotes() {
-    for (const std::string& note : source_.takeNotes()) ROS_WARN_STREAM("tf: " << note);
+    constexpr std::size_t kLongest = 600;
+    for (const std::string& note : source_.takeNotes()) {
+      ROS_WARN_STREAM("tf: " << plainText(note, kLongest));
+    }
   }
 
   void add(const tf2_msgs::TFMessage& message, bool is_static) {

@@ -14,8 +14,12 @@ from types import FrameType
 from typing import Callable, Iterable, Iterator, List, Optional, TypeVar
 
 from semantic_lidar_fusion.errors import MissingDependencyError, SemanticLidarFusionError
+from semantic_lidar_fusion.texts import plain_text
 
 T = TypeVar("T")
+
+# Lines hold names of files and texts of messages, which may hold anything.
+_LONGEST_LINE = 4000
 
 
 class Ended(BaseException):
@@ -58,8 +62,9 @@ def _forget_stdout() -> None:
 def _say(text: str) -> None:
     """One line on stderr, which may itself be closed or full."""
     name = os.path.basename(sys.argv[0])
+    line = plain_text(" ".join(text.split()), _LONGEST_LINE)
     try:
-        print("%s: %s" % (name, " ".join(text.split())), file=sys.stderr, flush=True)
+        print("%s: %s" % (name, line), file=sys.stderr, flush=True)
     except (OSError, ValueError):
         pass
 

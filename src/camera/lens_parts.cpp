@@ -6,6 +6,12 @@
 #include "polynomial.h"
 
 namespace semantic_lidar_fusion {
+namespace {
+
+/// A direction nearer to the axis than this has no azimuth that doubles can hold, rad.
+constexpr double kLeastAngle = 1e-150;
+
+}  // namespace
 
 void requireFiniteCoefficients(const LensParameters& parameters) {
   for (std::size_t i = 0; i < parameters.coefficients.size(); ++i) {
@@ -51,11 +57,13 @@ std::optional<Eigen::Vector2d> RadialLens::project(const Eigen::Vector3d& p) con
 std::optional<Eigen::Vector3d> RadialLens::ray(const Eigen::Vector2d& a) const {
   const double r = std::hypot(a.x(), a.y());
   if (r == 0.0) return Eigen::Vector3d::UnitZ();
-  const double most = radius(end_rad_);
-  if (r > most * (1.0 + kEdgeSlack) || r < radius(begin_rad_) * (1.0 - kEdgeSlack)) {
-    return std::nullopt;
-  }
-  const double theta = bisect([&](double t) { return radius(t) - r; }, begin_rad_, end_rad_);
+  const double least = radius(begin_rad_), most = radius(end_rad_);
+  if (r > most * (1.0 + kEdgeSlack) || r < least * (1.0 - kEdgeSlack)) return std::nullopt;
+  const double solved = r > least
+                            ? bisect([&](double t) { return radius(t) - r; }, begin_rad_, end_rad_)
+                            : begin_rad_;
+  // Around the axis of a lens whose radius is above 0 there lies a circle, not a point.
+  const double theta = std::max(solved, kLeastAngle);
   const double s = std::sin(theta) / r;
   return Eigen::Vector3d(a.x() * s, a.y() * s, std::cos(theta));
 }

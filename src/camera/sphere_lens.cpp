@@ -41,8 +41,11 @@ class SphereLens : public Lens {
     const double s = beta_ * a.squaredNorm();
     const double root = 1.0 - (2.0 * alpha_ - 1.0) * s;
     if (!(root >= -kEdgeSlack)) return std::nullopt;
-    const double z =
-        (1.0 - alpha_ * alpha_ * s) / (alpha_ * std::sqrt(std::max(0.0, root)) + 1.0 - alpha_);
+    // z = (1 - alpha^2 s) / (alpha sqrt(root) + 1 - alpha), which is 0 / 0 at the edge of a lens of
+    // alpha 1; with both multiplied by alpha sqrt(root) - (1 - alpha) it is not.
+    const double rise = alpha_ * std::sqrt(std::max(0.0, root));
+    const double z = alpha_ > 0.75 ? (rise - (1.0 - alpha_)) / (2.0 * alpha_ - 1.0)
+                                   : (1.0 - alpha_ * alpha_ * s) / (rise + 1.0 - alpha_);
     if (!std::isfinite(z)) return std::nullopt;
     const Eigen::Vector3d p = fromSecondSphere(Eigen::Vector3d(a.x(), a.y(), z));
     if (!(angleFromAxis(p) <= max_theta_rad_ + kEdgeSlack)) return std::nullopt;

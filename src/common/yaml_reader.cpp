@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cctype>
 #include <cmath>
+#include <filesystem>
 #include <fstream>
 #include <locale>
 #include <optional>
@@ -198,6 +199,9 @@ YAML::Node parseYaml(const std::string& given, const std::string& source_name) {
 }
 
 YAML::Node parseYamlFile(const std::string& path) {
+  // A pipe would be waited for, and a device may never end.
+  std::error_code error;
+  if (std::filesystem::is_other(path, error)) fail(path, "is a pipe or a device; must be a file");
   std::ifstream file(path, std::ios::binary);
   std::string text(kMaxBytes + 1, '\0');
   file.read(&text[0], static_cast<std::streamsize>(text.size()));

@@ -48,7 +48,7 @@ Transform transformOf(const Eigen::Vector3d& translation, double w, double x, do
   if (!translation.allFinite() || !rotation.coeffs().allFinite()) {
     throw DataError("transform has a number that is not finite");
   }
-  if (std::abs(rotation.norm() - 1.0) > 1e-2) {
+  if (std::abs(rotation.norm() - 1.0) > kLooseNorm) {
     throw DataError("transform has a quaternion of norm " + std::to_string(rotation.norm()) +
                     "; 1 is wanted");
   }

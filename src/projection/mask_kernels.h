@@ -111,7 +111,8 @@ constexpr double kAtanWhole = 3.14159265358979323846;
 /// The arms along which the two halves of a mask are swept.
 constexpr MaskSide kHalfSides[2] = {kMaskUp, kMaskDown};
 constexpr double kLeastMaskDistance = 1e-3;  ///< m
-/// Masks whose area is smaller than this part of their extent, px, are seen edge-on.
-constexpr float kEdgeOn = 1e-3f;
+/// Masks whose area is smaller than this part of their extent, px, are seen edge-on and hide
+/// nothing: they would be all slack, and that runs far beyond their acute corners.
+constexpr float kEdgeOn = 0.1f;
 
 }  // namespace semantic_lidar_fusion

@@ -17,38 +17,41 @@ EpochMonitor::EpochMonitor(EpochConfig config, std::function<void(StampNs)> star
       started_anew_(std::move(started_anew)),
       discarded_(std::move(discarded)) {}
 
-void EpochMonitor::observe(const std::string& source, StampNs stamp, Work work) {
+void EpochMonitor::observe(const std::string& source, StampNs stamp, Work work,
+                           StampNs tolerance_ns) {
   if (source == config_.lead) {
-    observeLead(stamp, std::move(work));
+    observeLead({source, stamp, tolerance_ns, Doubt::kElsewhere, 0, std::move(work)});
     return;
   }
-  const Doubt doubtful = doubt(sources_[source], stamp);
-  if (doubtful == Doubt::kNone) {
-    use(source, stamp, work);
+  Held message{source, stamp, 0, doubt(sources_[source], stamp), 0, std::move(work)};
+  if (message.doubt == Doubt::kNone) {
+    use(message);
   } else {
-    hold({source, stamp, doubtful, 0, std::move(work)});
+    hold(std::move(message));
   }
 }
 
-void EpochMonitor::observeLead(StampNs stamp, Work work) {
+void EpochMonitor::observeLead(Held message) {
   const auto follows = [&](StampNs newest) {
-    return stamp >= newest - config_.lead_disorder_ns && stamp <= newest + kForwardNs;
+    return message.stamp + message.tolerance_ns >= newest - config_.lead_disorder_ns &&
+           message.earliest() <= newest + kForwardNs;
   };
   const auto is_lead = [&](const Held& held) { return held.source == config_.lead; };
   if (!lead_newest_ || follows(*lead_newest_)) {
     for (const Held& wrong : take(is_lead)) discard(wrong);
-    use(config_.lead, stamp, work);
+    use(message);
     goOn();
     return;
   }
   std::optional<StampNs> newest_held;
   for (const Held& held : held_) {
-    if (is_lead(held)) newest_held = std::max(newest_held.value_or(held.stamp), held.stamp);
+    if (!is_lead(held)) continue;
+    newest_held = std::max(newest_held.value_or(held.earliest()), held.earliest());
   }
   if (newest_held && !follows(*newest_held)) {
     for (const Held& wrong : take(is_lead)) discard(wrong);
   }
-  hold({config_.lead, stamp, Doubt::kElsewhere, 0, std::move(work)});
+  hold(std::move(message));
   if (std::count_if(held_.begin(), held_.end(), is_lead) >= config_.confirmations) startAnew();
 }
 
@@ -77,11 +80,11 @@ void EpochMonitor::hold(Held message) {
   discard(wrong);
 }
 
-void EpochMonitor::use(const std::string& source, StampNs stamp, const Work& work) {
-  std::optional<StampNs>& newest = sources_[source].newest;
-  newest = newest ? std::max(*newest, stamp) : stamp;
-  if (source == config_.lead) lead_newest_ = newest;
-  work();
+void EpochMonitor::use(const Held& message) {
+  std::optional<StampNs>& newest = sources_[message.source].newest;
+  newest = std::max(newest.value_or(message.earliest()), message.earliest());
+  if (message.source == config_.lead) lead_newest_ = newest;
+  message.work();
 }
 
 /// The source goes on from here: its clock may have been set back for good.
@@ -131,12 +134,12 @@ void EpochMonitor::startAnew() {
     source.newest.reset();
   }
   started_anew_(first->stamp);
-  lead_newest_ = first->stamp;
+  lead_newest_ = first->earliest();
   for (const Held& held : messages) {
     if (held.source != config_.lead && doubt(sources_[held.source], held.stamp) != Doubt::kNone) {
       discard(held);
     } else {
-      use(held.source, held.stamp, held.work);
+      use(held);
     }
   }
 }

@@ -54,8 +54,8 @@ void FusionQueue::setSemantics(int camera, StampNs image_stamp, bool ready) {
 }
 
 bool FusionQueue::follows(const Cloud& cloud) const {
-  if (last_stamp_ns_ && cloud.stamp < *last_stamp_ns_) return false;
-  return cloud.size() == 0 || !last_first_point_ns_ || cloud.first_point_ns > *last_first_point_ns_;
+  if (cloud.empty() || !last_stamp_ns_) return true;
+  return cloud.stamp >= *last_stamp_ns_ && cloud.first_point_ns > *last_first_point_ns_;
 }
 
 void FusionQueue::addCloud(std::shared_ptr<const Cloud> cloud, StampNs now_ns) {
@@ -99,6 +99,10 @@ void FusionQueue::matchKey(Pending* pending) {
 CompletedScan::View FusionQueue::view(const Pending& pending, std::size_t camera,
                                       StampNs now_ns) const {
   CompletedScan::View view;
+  if (pending.cloud->empty()) {
+    view.state = ViewState::kNone;
+    return view;
+  }
   const StampNs timeout_ns = config_.timeout_ns[camera];
   StampNs deadline_ns = pending.arrived_ns + timeout_ns + config_.selection_grace_ns;
   const Decision* const decided = pending.key_ns ? decisions_.find(*pending.key_ns) : nullptr;
@@ -124,7 +128,7 @@ CompletedScan::View FusionQueue::view(const Pending& pending, std::size_t camera
 
 std::vector<CompletedScan> FusionQueue::advance(StampNs now_ns) {
   for (Pending& pending : pending_) {
-    if (!pending.key_ns) matchKey(&pending);
+    if (!pending.key_ns && !pending.cloud->empty()) matchKey(&pending);
   }
   std::vector<CompletedScan> completed;
   while (!pending_.empty()) {

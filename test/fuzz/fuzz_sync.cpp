@@ -79,17 +79,22 @@ void runMonitor(Reader* reader) {
         expect(!message.source.empty(), "what is discarded has a name");
       });
   while (reader->left() > 0) {
-    const std::string source = kSources[reader->choice(4)];
+    const unsigned kind = reader->choice(5);
+    const std::string source = kSources[kind % 4];
     const StampNs stamp = takeStamp(reader);
+    const StampNs tolerance = kind == 4 ? kNsPerSecond : 0;  // a scan without points
     const std::size_t epochs_before = epochs;
-    monitor.observe(source, stamp, [&, source, stamp, number = in] {
+    const auto use = [&, source, stamp, tolerance, number = in] {
       ++used;
       expect(used_numbers.insert(number).second, "a message is used once");
       if (source != config.lead) return;
-      expect(!lead || stamp >= *lead - config.lead_disorder_ns, "an epoch does not go back");
-      expect(!lead || stamp <= *lead + EpochMonitor::kForwardNs, "an epoch has no leaps");
-      lead = lead ? std::max(*lead, stamp) : stamp;
-    });
+      const StampNs least = stamp - tolerance;
+      expect(!lead || stamp + tolerance >= *lead - config.lead_disorder_ns,
+             "an epoch does not go back");
+      expect(!lead || least <= *lead + EpochMonitor::kForwardNs, "an epoch has no leaps");
+      lead = lead ? std::max(*lead, least) : least;
+    };
+    monitor.observe(source, stamp, use, tolerance);
     ++in;
     expect(used + discarded + monitor.held() == in, "messages are used, discarded or held");
     expect(monitor.held() <= 4 * EpochMonitor::kMaxHeld, "what is held is bounded");

@@ -189,3 +189,13 @@ def test_interrupt_and_success(capsys):
 
 def test_progress_passes_everything_on():
     assert list(cli.progress(range(5), 5, "x")) == [0, 1, 2, 3, 4]
+
+
+def test_texts_of_messages_become_one_short_printable_line():
+    from semantic_lidar_fusion.texts import plain_text
+
+    assert plain_text("/velodyne_link") == "/velodyne_link"
+    assert plain_text("Straße 3") == "Straße 3"
+    assert plain_text("a\nb\x1b[31m\u2028") == r"a\nb\x1b[31m\u2028"
+    long = plain_text("x" * 1000000)
+    assert len(long) < 120 and "1000000 characters" in long

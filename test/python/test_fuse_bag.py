@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 bag_factory = pytest.importorskip("bag_factory")
+import onnx_factory  # noqa: E402
 import rosbag  # noqa: E402
 
 from bag_factory import CLASS_NAMES, START_NS, Camera, Drive, read_cloud  # noqa: E402
@@ -889,7 +891,48 @@ def test_files_of_similar_names_are_left_alone(room, tmp_path):
     assert (tmp_path / "out.bag.unfinished-1-2").is_symlink()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("closed", ["<&- >&- 2>&-", "2>&-"])
+def test_closed_streams_do_not_become_files(room, tmp_path, closed):
+    command = [program(), room.bag, tmp_path / "out.bag", "--rig", room.rig]
+    line = " ".join(shlex.quote(str(word)) for word in command) + " " + closed
+    assert subprocess.run(["sh", "-c", line], timeout=120).returncode == 0
+    expected = room.fuse(name="expected.bag").of("/points_semantic")
+    with rosbag.Bag(str(tmp_path / "out.bag")) as bag:
+        assert [m for _, m, _ in bag.read_messages("/points_semantic")] == expected
+
+
+def test_pipes_and_devices_are_refused_at_once(room, tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(str(pipe))
+    masked = "cameras.front.mask=%s"
+    for odd in (pipe, "/dev/zero"):
+        for words in (
+            (odd, tmp_path / "out.bag", "--rig", room.rig),
+            (room.bag, tmp_path / "out.bag", "--rig", odd),
+            (room.bag, tmp_path / "out.bag", "--rig", room.rig, "--set", masked % odd),
+        ):
+            result = run(*words)
+            assert_fails(result, str(odd))
+            assert len(result.stderr.splitlines()) == 1, result.stderr
+
+
+def test_a_model_that_the_bags_scores_replace_is_said(room, tmp_path):
+    count = len(CLASS_NAMES)
+    network = onnx_factory.convolution(64, 48, [[0.0] * 3] * count, [0.0] * count)
+    (tmp_path / "net.onnx").write_bytes(network)
+    model = tmp_path / "net.yaml"
+    model.write_text(
+        "file: net.onnx\ninput: {width: 64, height: 48, channels: rgb, scale: 1}\n"
+        "classes: {%s}\n" % ", ".join("%s: [%d]" % (c, i) for i, c in enumerate(CLASS_NAMES))
+    )
+    fused = room.fuse("--set", "segmentation.model=%s" % model, name="model.bag")
+    said = fused.result.stderr
+    assert "camera front: its scores come from the bag" in said, said
+    assert "segmentation.model is not used" in said
+    assert fused.of("/points_semantic") == room.fuse(name="bag.bag").of("/points_semantic")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupt_leaves_nothing(room, tmp_path, number):
     process = started(room, tmp_path)
     process.send_signal(number)

@@ -184,8 +184,22 @@ def test_a_refused_transform_says_why(tmp_path):
     def change(message):
         rotation = message.transforms[0].transform.rotation
         for axis in "xyzw":
+            setattr(rotation, axis, 1.2 * getattr(rotation, axis))
+
+    made = changed_tf(tmp_path, change)
+    result = run(made.bag, made.folder / "out.bag", "--rig", made.rig)
+    assert result.returncode == 1, "no point got a class"
+    assert "odom <- base_link" in result.stderr and "1.2" in result.stderr
+
+
+def test_a_transform_that_is_not_quite_normalised_is_taken(tmp_path):
+    def change(message):
+        rotation = message.transforms[0].transform.rotation
+        for axis in "xyzw":
             setattr(rotation, axis, 1.02 * getattr(rotation, axis))
 
     made = changed_tf(tmp_path, change)
     result = run(made.bag, made.folder / "out.bag", "--rig", made.rig)
-    assert "odom <- base_link" in result.stderr and "1.02" in result.stderr
+    assert result.returncode == 0, result.stderr
+    lines = [line for line in result.stderr.splitlines() if "norm 1.02" in line]
+    assert len(lines) == 1 and "warning" in lines[0] and "1 is wanted" in lines[0]

@@ -20,8 +20,12 @@ struct StampedPose {
   Transform T_fixed_vehicle = Transform::Identity();
 };
 
-/// A pose as messages tell it. Throws DataError if a number is not finite or the quaternion's norm
-/// is further than 1e-2 from 1; within that it is normalised.
+/// How far the norm of a pose's quaternion may be off 1: by rounding, and by a filter that does not
+/// normalise, which is worth a word. What is farther off is no rotation.
+constexpr double kRoundedNorm = 0.01, kLooseNorm = 0.1;
+
+/// A pose as messages tell it, its quaternion normalised. Throws DataError if a number is not
+/// finite or the norm is off 1 by more than kLooseNorm.
 Transform transformOf(const Eigen::Vector3d& translation, double w, double x, double y, double z);
 
 /// Linear in translation, slerp in rotation; `fraction` 0 gives a, 1 gives b.

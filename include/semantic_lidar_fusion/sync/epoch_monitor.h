@@ -15,6 +15,9 @@
 /// A new epoch takes up what is held and lies near it. Where the lead goes on for kLeadsToSettle
 /// messages instead, what only went back is taken up late, and the rest is discarded.
 ///
+/// A message of the lead may know its time only roughly (a scan without points has its header's):
+/// it follows if any time within its tolerance does, and later messages need not be after it.
+///
 /// Not thread-safe. The work of a message runs within `observe` of that or of a later message.
 #pragma once
 
@@ -61,8 +64,9 @@ class EpochMonitor {
                std::function<void(const DiscardedMessage&)> discarded);
 
   /// A message of `source` (a name for messages that come in one order, e.g. the topic) with its
-  /// true time. `work` uses it and does not throw: it runs now, later, or never.
-  void observe(const std::string& source, StampNs stamp, Work work);
+  /// true time. `work` uses it and does not throw: it runs now, later, or never. `tolerance_ns`:
+  /// how far the true time of a message of the lead may be off `stamp`.
+  void observe(const std::string& source, StampNs stamp, Work work, StampNs tolerance_ns = 0);
 
   std::size_t held() const { return held_.size(); }
 
@@ -75,15 +79,18 @@ class EpochMonitor {
   struct Held {
     std::string source;
     StampNs stamp = 0;
+    StampNs tolerance_ns = 0;
     Doubt doubt = Doubt::kNone;
     int leads = 0;  ///< messages of the lead that went on since
     Work work;
+
+    StampNs earliest() const { return stamp - tolerance_ns; }
   };
 
-  void observeLead(StampNs stamp, Work work);
+  void observeLead(Held message);
   Doubt doubt(const Source& source, StampNs stamp) const;
   void hold(Held message);
-  void use(const std::string& source, StampNs stamp, const Work& work);
+  void use(const Held& message);
   void useLate(const Held& message);
   void discard(const Held& message);
   /// Takes out of `held_` what `is_meant` says.

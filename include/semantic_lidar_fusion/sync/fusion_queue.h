@@ -4,6 +4,7 @@
 /// Scans leave in the order in which they came. A scan is known by its key, the true time of its
 /// first point; two scans may share a t_ref. Each camera of a scan is expected, none, ready or
 /// failed; a scan completes when nothing is expected any more. One image may serve several scans.
+/// A cloud without points has neither key nor images: it waits only for the scans before it.
 ///
 /// Deadlines. Whoever chooses the images has a deadline of its own: the selection of a camera is
 /// waited for from the arrival of the cloud for the camera's timeout and a grace, and the semantics
@@ -65,8 +66,8 @@ class FusionQueue {
   void addSelection(StampNs key_ns, int camera, std::optional<StampNs> image_stamp, StampNs now_ns);
   /// The semantics of an image are at hand (or will never be).
   void setSemantics(int camera, StampNs image_stamp, bool ready);
-  /// Clouds come in the order of their scans; one that does not is dropped and counted. A cloud
-  /// without points has no first point: its stamp must not be before the last one's.
+  /// Clouds come in the order of their scans; one that does not is dropped and counted. The stamp
+  /// of a cloud without points is its header's and tells no order.
   void addCloud(std::shared_ptr<const Cloud> cloud, StampNs now_ns);
 
   /// Scans that are complete at `now_ns`, in order.

@@ -18,6 +18,7 @@ void checkFile(const std::string& path) {
   struct stat status {};
   if (::stat(path.c_str(), &status) != 0) throw Error(path + ": " + std::strerror(errno));
   if (S_ISDIR(status.st_mode)) throw Error(path + ": is a directory, not a bag");
+  if (!S_ISREG(status.st_mode)) throw Error(path + ": is a pipe or a device, not a bag");
   if (status.st_size == 0) throw Error(path + ": is an empty file, not a bag");
 }
 

@@ -13,12 +13,22 @@
 #include <string>
 #include <vector>
 
+#include "edge/declared_lengths.h"
+
 namespace semantic_lidar_fusion {
 
 /// The header of any message that starts with one; the rest is not read.
 struct StampedMessage {
   std_msgs::Header header;
 };
+
+/// A message of a bag. Null where the bag has another definition of the type. Throws DataError
+/// where the message declares more than it holds, before that is allocated.
+template <class M>
+boost::shared_ptr<M> messageOf(const rosbag::MessageInstance& message) {
+  if (!message.instantiate<DeclaredLengths<M>>()) return nullptr;
+  return message.instantiate<M>();
+}
 
 class BagInput {
  public:

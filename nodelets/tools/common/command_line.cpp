@@ -2,14 +2,18 @@
 #include "tools/common/command_line.h"
 
 #include <console_bridge/console.h>
+#include <fcntl.h>
+#include <unistd.h>
 
 #include <cmath>
 #include <csignal>
 #include <cstdio>
 #include <cstdlib>
 #include <exception>
+#include <initializer_list>
 
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/plain_text.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -21,12 +25,26 @@ void rememberSignal(int signal) { caught_signal = signal; }
 /// A signal asked for the end; what was written is removed on the way out.
 struct Interrupted {};
 
+/// All that end a program, unless the caller has them ignored (nohup).
 void catchSignals() {
-  struct sigaction action {};
-  action.sa_handler = rememberSignal;
-  ::sigaction(SIGINT, &action, nullptr);
-  ::sigaction(SIGTERM, &action, nullptr);
+  for (const int signal : {SIGINT, SIGTERM, SIGHUP, SIGPIPE}) {
+    struct sigaction action {
+    }, before{};
+    action.sa_handler = rememberSignal;
+    ::sigaction(signal, nullptr, &before);
+    if (before.sa_handler != SIG_IGN) ::sigaction(signal, &action, nullptr);
+  }
   ::signal(SIGXFSZ, SIG_IGN);  // a file size limit is then an error of the write
+}
+
+/// Standard streams that are closed become /dev/null: the first file that is opened would take
+/// their place, and progress go into it.
+void openClosedStreams() {
+  for (const int stream : {STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO}) {
+    if (::fcntl(stream, F_GETFD) != -1) continue;
+    // The lowest number that is free is this one.
+    if (::open("/dev/null", O_RDWR) != stream) std::abort();
+  }
 }
 
 std::vector<std::string> splitAtCommas(const std::string& text) {
@@ -150,6 +168,7 @@ void printText(const std::string& text) {
 int runMain(const std::string& name, const std::function<void()>& run) {
   // Libraries below report through exceptions too; their own lines would come twice.
   console_bridge::setLogLevel(console_bridge::CONSOLE_BRIDGE_LOG_NONE);
+  openClosedStreams();
   catchSignals();
   try {
     run();
@@ -161,7 +180,10 @@ int runMain(const std::string& name, const std::function<void()>& run) {
     std::fprintf(stderr, "%s: interrupted; nothing was written\n", name.c_str());
     return 128 + caught_signal;
   } catch (const std::exception& e) {
-    std::fprintf(stderr, "%s: error: %s\n", name.c_str(), e.what());
+    if (caught_signal != 0) return 128 + caught_signal;  // of the write that it broke
+    // Errors hold names of files and texts of messages, which may hold anything.
+    constexpr std::size_t kLongest = 4000;
+    std::fprintf(stderr, "%s: error: %s\n", name.c_str(), plainText(e.what(), kLongest).c_str());
     return 1;
   }
 }

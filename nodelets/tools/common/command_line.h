@@ -81,7 +81,7 @@ class OptionReader {
   std::map<std::string, Take> values_;
 };
 
-/// Throws what runMain() reports as an interruption if SIGINT or SIGTERM came.
+/// Throws what runMain() reports as an interruption if a signal that ends programs came.
 void endIfInterrupted();
 
 /// Throws Error where nobody takes the text: a full disk, a closed stdout.

@@ -59,7 +59,7 @@ template <typename Message>
 boost::shared_ptr<Message> instantiate(const rosbag::MessageInstance& message) {
   boost::shared_ptr<Message> result;
   try {
-    result = message.instantiate<Message>();
+    result = messageOf<Message>(message);
   } catch (const ros::serialization::StreamOverrunException&) {
     throw DataError("is shorter than a " + message.getDataType());
   } catch (const std::bad_alloc&) {
@@ -198,6 +198,12 @@ class DriveReader::Router {
         reader_.addImage(m, name + " " + semanticsName(camera.input), &track->semantics,
                          &StoredImage::kept_pixels);
       });
+      if (!rig_.segmentation.model.empty() && camera.input == CameraInput::kScores) {
+        DropLog::warn(name + ": its scores come from the bag (" + semantics +
+                      "); segmentation.model is not used for it. To use it, name another topic in "
+                      "cameras." +
+                      camera.name + ".scores");
+      }
     } else if (rig_.segmentation.model.empty() || camera.input != CameraInput::kScores) {
       DropLog::warn(problem);
     }
@@ -243,8 +249,8 @@ class DriveReader::Router {
 
  public:
   void addTransforms(const rosbag::MessageInstance& m, bool is_static) {
-    index_->transforms.push_back(m);
     const auto message = instantiate<tf2_msgs::TFMessage>(m);
+    index_->transforms.push_back(m);  // those that can be copied
     for (const auto& transform : message->transforms) {
       const std::uint64_t repeated = poses_->counters().repeated;
       if (!poses_->add(transform, is_static) && poses_->counters().repeated == repeated) {

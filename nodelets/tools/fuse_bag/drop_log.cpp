@@ -4,6 +4,8 @@
 #include <cstdio>
 #include <set>
 
+#include "semantic_lidar_fusion/common/plain_text.h"
+
 namespace semantic_lidar_fusion {
 namespace {
 
@@ -11,7 +13,10 @@ void tellOnce(const std::string& line) {
   static std::mutex mutex;
   static std::set<std::string> told;
   const std::lock_guard<std::mutex> lock(mutex);
-  if (told.insert(line).second) std::fprintf(stderr, "fuse_bag: %s\n", line.c_str());
+  if (!told.insert(line).second) return;
+  // Lines hold texts of messages, which may hold anything.
+  constexpr std::size_t kLongest = 2000;
+  std::fprintf(stderr, "fuse_bag: %s\n", plainText(line, kLongest).c_str());
 }
 
 }  // namespace

@@ -50,7 +50,7 @@ void fuse(const FuseBagOptions& options) {
   reuseMemory();
   BagFusion fusion(options, endIfInterrupted);
   fusion.run();
-  if (!options.quiet) std::fputs(fusion.summary().c_str(), stdout);
+  if (!options.quiet) printText(fusion.summary());
   const std::string failure = fusion.whyNothingIsFused();
   if (!failure.empty()) throw Error(failure);
 }

@@ -37,11 +37,11 @@ ScanSource::ScanSource(const Rig& rig, const DriveIndex& index, const ImageSourc
 
 TimedCloud ScanSource::decode(const rosbag::MessageInstance& message) {
   if (rig_.lidar.input == LidarInput::kPackets) {
-    const auto scan = message.instantiate<VelodyneScan>();
+    const auto scan = messageOf<VelodyneScan>(message);
     if (!scan) throw DataError("has another definition of velodyne_msgs/VelodyneScan");
     return lidar_.decode(*scan);
   }
-  const auto cloud = message.instantiate<sensor_msgs::PointCloud2>();
+  const auto cloud = messageOf<sensor_msgs::PointCloud2>(message);
   if (!cloud) throw DataError("has another definition of sensor_msgs/PointCloud2");
   return lidar_.decode(*cloud);
 }

@@ -51,7 +51,7 @@ void VisibilityTruth::apply(StampNs first_ns, std::size_t points,
                             std::vector<CameraView>* views) const {
   const auto found = scans_.find(first_ns);
   const auto message =
-      found == scans_.end() ? nullptr : found->second.instantiate<sensor_msgs::PointCloud2>();
+      found == scans_.end() ? nullptr : messageOf<sensor_msgs::PointCloud2>(found->second);
   if (!message) throw DataError(std::string(kTopic) + " has no scan of this time");
   const std::vector<std::uint16_t> flags = visibleFlags(*message);
   if (flags.size() != points) {

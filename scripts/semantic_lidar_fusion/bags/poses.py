@@ -106,8 +106,11 @@ class PoseSeries:
         return rotations
 
 
-# As fuse_bag takes them (transformOf in src/motion/pose_buffer.cpp).
-_NORM_TOLERANCE = 1e-2
+# As fuse_bag takes them (transformOf in motion/pose_buffer.h): off by rounding, and by a filter that
+# does not normalise.
+_ROUNDED_NORM, _LOOSE_NORM = 0.01, 0.1
+# Numbers of a bag can make any number of reasons.
+_MOST_REASONS = 8
 
 
 def from_message(transform: Any) -> np.ndarray:
@@ -118,7 +121,7 @@ def from_message(transform: Any) -> np.ndarray:
     if not np.isfinite(quaternion).all() or not np.isfinite(translation).all():
         raise DataError("a number is not finite")
     norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1.0) > _NORM_TOLERANCE:
+    if abs(norm - 1.0) > _LOOSE_NORM:
         raise DataError("a quaternion of norm %.6g; 1 is wanted" % norm)
     return make_transform(to_rotation(quaternion), translation)
 
@@ -126,7 +129,8 @@ def from_message(transform: Any) -> np.ndarray:
 class TransformTree:
     """The tf of a bag: static and moving edges, looked up along the tree.
 
-    dropped: reason -> number of transforms that could not be used."""
+    dropped: reason -> number of transforms that could not be used.
+    loose: number of transforms whose quaternion had to be normalised."""
 
     def __init__(self) -> None:
         self._parents: Dict[str, str] = {}
@@ -134,6 +138,7 @@ class TransformTree:
         self._readings: Dict[str, Tuple[List[int], List[np.ndarray]]] = {}
         self._series: Dict[str, PoseSeries] = {}
         self.dropped: Dict[str, int] = {}
+        self.loose = 0
 
     @staticmethod
     def from_bag(reader: Any) -> "TransformTree":
@@ -143,8 +148,17 @@ class TransformTree:
             for entry in reader.read([topic], _TF_TYPES):
                 for transform in entry.message.transforms:
                     tree.add(transform, topic == "/tf_static")
-        for reason, count in sorted(tree.dropped.items()):
+        reasons = sorted(tree.dropped.items())
+        for reason, count in reasons[:_MOST_REASONS]:
             cli.warn("%s: %d transforms are dropped: %s" % (reader.path, count, reason))
+        if reasons[_MOST_REASONS:]:
+            more = sum(count for _, count in reasons[_MOST_REASONS:])
+            cli.warn("%s: %d more transforms are dropped for such reasons" % (reader.path, more))
+        if tree.loose:
+            cli.warn(
+                "%s: %d transforms have a quaternion of a norm that is not 1 and are taken as if "
+                "normalised" % (reader.path, tree.loose)
+            )
         return tree
 
     def __len__(self) -> int:
@@ -167,6 +181,8 @@ class TransformTree:
         except DataError as error:
             self.dropped[str(error)] = self.dropped.get(str(error), 0) + 1
             return
+        r = stamped.transform.rotation
+        self.loose += abs(float(np.linalg.norm((r.x, r.y, r.z, r.w))) - 1.0) > _ROUNDED_NORM
         if not static and child in self._static:
             return
         self._parents[child] = parent

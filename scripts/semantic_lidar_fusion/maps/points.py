@@ -17,6 +17,7 @@ from semantic_lidar_fusion.labels import NO_LABEL, LabelSet
 from semantic_lidar_fusion.maps.reading import DYNAMIC, STATIC, Reading, read
 from semantic_lidar_fusion.maps.records import voxel_indices
 from semantic_lidar_fusion.maps.source import MapSource, class_colors
+from semantic_lidar_fusion.texts import plain_text
 
 _COUNTS = ("observations", "looks", "labelled")
 
@@ -88,7 +89,7 @@ def write_ply(source: MapSource, folder: str) -> Dict[str, Any]:
     fields = [(n, k) for n, k in point_fields(source.labels) if n not in ("rgb", "label")]
     colors = [(name, "u1") for name in ("red", "green", "blue", "label")]
     fields = fields[:3] + colors + fields[3:]
-    frame = source.header.frame_id.encode("ascii", "backslashreplace").decode("ascii")
+    frame = plain_text(source.header.frame_id).encode("ascii", "backslashreplace").decode("ascii")
     for name, layer in files_of(source):
         with open(os.path.join(folder, name + ".ply"), "wb") as file:
             text = "ply\nformat binary_little_endian 1.0\n"

@@ -206,7 +206,7 @@ TEST(Rosette, IsCutByAngleAndSaysSo) {
     });
     EXPECT_GT(links, scan.cloud.size()) << points;
     EXPECT_LT(across, links / 20) << points;  // walls and ground meet without an edge
-    EXPECT_LT(hiddenShare(scan.cloud), 0.03) << points;
+    EXPECT_LT(hiddenShare(scan.cloud), 0.001) << points;
   }
 }
 

@@ -279,6 +279,40 @@ TEST(DecodedImage, JpegThatEndsTooEarlyIsRefused) {
   EXPECT_EQ(cv::norm(decodedImage(padded), expected, cv::NORM_INF), 0.0);
 }
 
+TEST(CompressedImage, AHeaderOfAbsurdSizeIsRefusedBeforeAnythingIsDecoded) {
+  cv::Mat picture(12, 16, CV_8UC3, cv::Scalar(1, 2, 3));
+  for (const char* ending : {".jpg", ".png", ".bmp"}) {
+    sensor_msgs::CompressedImage message;
+    message.format = ending;
+    cv::imencode(ending, picture, message.data);
+    const auto size = encodedSize(message.data);
+    ASSERT_TRUE(size) << ending;
+    EXPECT_EQ(*size, (ImageSize{16, 12})) << ending;
+    EXPECT_EQ(decodedImage(message).size(), picture.size()) << ending;
+    // 30 000 x 30 000.
+    const std::string name = ending;
+    if (name == ".jpg") {
+      const std::uint8_t frame[] = {0xFF, 0xC0};
+      auto at = std::search(message.data.begin(), message.data.end(), frame, frame + 2);
+      ASSERT_NE(at, message.data.end());
+      at[5] = at[7] = 30000 >> 8;
+      at[6] = at[8] = 30000 & 255;
+    } else {
+      const bool big = name == ".png";
+      for (const std::size_t begin : {big ? 16 : 18, big ? 20 : 22}) {
+        message.data[begin + (big ? 2 : 1)] = 30000 >> 8;
+        message.data[begin + (big ? 3 : 0)] = 30000 & 255;
+      }
+    }
+    try {
+      decodedImage(message);
+      ADD_FAILURE() << ending << " is decoded";
+    } catch (const DataError& error) {
+      EXPECT_NE(std::string(error.what()).find("30000 x 30000"), std::string::npos) << error.what();
+    }
+  }
+}
+
 TEST(DecodedImage, JpegOfDamagedDataIsOpencvsToJudge) {
   cv::Mat picture(64, 48, CV_8UC3);
   cv::RNG(5).fill(picture, cv::RNG::UNIFORM, 0, 256);

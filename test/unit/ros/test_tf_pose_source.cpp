@@ -280,9 +280,9 @@ TEST(TfPoseSource, RefusesWithTheReasonOnceForEachFrame) {
     const std::string text = reasonOf(spoil);
     EXPECT_NE(text.find(word), std::string::npos) << text;
   };
-  expect("1.02", [](Message& m) {
-    m.transform.rotation.w *= 1.02;
-    m.transform.rotation.z *= 1.02;
+  expect("1.2", [](Message& m) {
+    m.transform.rotation.w *= 1.2;
+    m.transform.rotation.z *= 1.2;
   });
   expect("norm 0", [](Message& m) { m.transform.rotation.w = m.transform.rotation.z = 0.0; });
   expect("stamp is 0", [](Message& m) { m.header.stamp = ros::Time(); });
@@ -291,6 +291,62 @@ TEST(TfPoseSource, RefusesWithTheReasonOnceForEachFrame) {
   expect("below itself", [](Message& m) { m.child_frame_id = "odom"; });
   expect("finite", [](Message& m) { m.transform.translation.y = std::nan(""); });
   expect("odometry.largest_coordinate_m", [](Message& m) { m.transform.translation.x = 1e39; });
+}
+
+TEST(TfPoseSource, ARotationThatIsNotQuiteNormalisedIsTakenAndSaidOnce) {
+  TfPoseSource source(defaults()), exact(defaults());
+  for (int i = 0; i < 3; ++i) {
+    auto message = stamped("odom", "base_link", kStart + i * kMs, driven(i));
+    exact.add(message, false);
+    message.transform.rotation.w *= 1.02;
+    message.transform.rotation.z *= 1.02;
+    EXPECT_TRUE(source.add(message, false)) << source.problem();
+  }
+  EXPECT_EQ(notesOf(exact), "");
+  const std::string text = notesOf(source);
+  EXPECT_NE(text.find("norm 1.02"), std::string::npos) << text;
+  EXPECT_EQ(std::count(text.begin(), text.end(), '\n'), 1) << text;
+  EXPECT_EQ(source.counters().rejected, 0u);
+  expectEqual(*source.odometry().lookup(kStart + kMs), *exact.odometry().lookup(kStart + kMs),
+              1e-12);
+}
+
+TEST(TfPoseSource, InventedFramesTakeNoMoreThanTheirRoom) {
+  TfPoseSourceConfig config = defaults();
+  config.history_ns = 10 * kNsPerSecond;
+  TfPoseSource source(config), quiet(config);
+  for (TfPoseSource* each : {&source, &quiet}) {
+    each->add(stamped("base_link", "velodyne", kStart, pose(1, 0, 0)), true);
+  }
+  std::mt19937_64 random(3);
+  for (int i = 0; i < 300; ++i) {
+    const StampNs stamp = kStart + i * 10 * kMs;
+    for (TfPoseSource* each : {&source, &quiet}) {
+      each->add(stamped("odom", "base_link", stamp, driven(0.01 * i)), false);
+    }
+    for (int k = 0; k < 10; ++k) {
+      const std::string name = std::to_string(random());
+      source.add(stamped(k % 2 ? "odom" : name + "x", name, stamp, pose(1, 2, 3)), false);
+    }
+  }
+  const std::string notes = notesOf(source);
+  EXPECT_NE(notes.find("which node invents names?"), std::string::npos) << notes;
+  EXPECT_EQ(std::count(notes.begin(), notes.end(), '\n'), 1) << notes;
+  ASSERT_EQ(source.odometry().readings().size(), quiet.odometry().readings().size());
+  for (std::size_t i = 0; i < quiet.odometry().readings().size(); ++i) {
+    expectEqual(source.odometry().readings()[i].T_fixed_vehicle,
+                quiet.odometry().readings()[i].T_fixed_vehicle, 1e-9);
+  }
+  EXPECT_TRUE(source.extrinsics("base_link", "velodyne")) << "static frames come once, and stay";
+  for (int i = 0; i < 11000; ++i) {
+    source.add(stamped("base_link", "s" + std::to_string(i), kStart, pose(0, 0, 0)), true);
+  }
+  EXPECT_NE(notesOf(source).find("static frames already"), std::string::npos);
+  EXPECT_TRUE(source.extrinsics("base_link", "s9000"));
+  EXPECT_FALSE(source.extrinsics("base_link", "s10500"));
+  auto long_name = stamped("odom", std::string(1000000, 'x'), kStart, pose(0, 0, 0));
+  EXPECT_FALSE(source.add(long_name, false));
+  EXPECT_LT(source.problem().size(), 200u);
 }
 
 TEST(TfPoseSource, TwoValuesOfAStaticTransformAreSaidOnce) {

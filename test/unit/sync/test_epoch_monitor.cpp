@@ -24,11 +24,12 @@ struct Seen {
               used.clear();
             },
             [this](const DiscardedMessage& message) { ++discarded[message.source]; }) {}
-  void add(const std::string& source, StampNs stamp) {
-    monitor.observe(source, stamp, [=] {
+  void add(const std::string& source, StampNs stamp, StampNs tolerance_ns = 0) {
+    const auto use = [=] {
       used[source].push_back(stamp);
       ++taken[source];
-    });
+    };
+    monitor.observe(source, stamp, use, tolerance_ns);
   }
 
   std::vector<StampNs> epochs;                       ///< where each epoch but the first starts
@@ -142,6 +143,37 @@ TEST(EpochMonitor, ALeadThatIsCheckedBeforeNeedsNoSecondMessage) {
   addScan(&seen, kStart);
   EXPECT_EQ(seen.epochs, std::vector<StampNs>{kStart});
   EXPECT_EQ(seen.used["image"].size(), 3u);
+}
+
+TEST(EpochMonitor, AMessageOfTheLeadWhoseTimeIsRoughNeitherStartsNorHoldsUpAnEpoch) {
+  // Stamps of drivers for a scan without points: its end or begin, late by the way of a message.
+  for (const StampNs off : {-300 * kMs, StampNs{0}, 100 * kMs, 300 * kMs}) {
+    Seen seen;
+    for (int i = 0; i < 40; ++i) {
+      const bool empty = i % 3 == 1 || (i > 20 && i < 30);
+      seen.add("lidar", kStart + i * 100 * kMs + (empty ? off : 0), empty ? kNsPerSecond : 0);
+    }
+    EXPECT_TRUE(seen.epochs.empty()) << off;
+    EXPECT_EQ(seen.taken["lidar"], 40) << off;
+  }
+}
+
+TEST(EpochMonitor, RoughTimesAloneTellAJumpAndWhereTheLeadIs) {
+  for (const StampNs jump : {-20 * kNsPerSecond, 20 * kNsPerSecond}) {
+    Seen seen;
+    for (int i = 0; i < 5; ++i) addScan(&seen, kStart + i * 100 * kMs);
+    for (int i = 0; i < 100; ++i) {
+      seen.add("image", kStart + jump + i * 100 * kMs);
+      seen.add("lidar", kStart + jump + i * 100 * kMs, kNsPerSecond);
+    }
+    EXPECT_EQ(seen.epochs, std::vector<StampNs>{kStart + jump});
+    EXPECT_EQ(seen.used["lidar"].size(), 100u);
+    EXPECT_EQ(seen.used["image"].size(), 100u);
+    // With points again, a little before the header of the last one without.
+    seen.add("lidar", kStart + jump + 9850 * kMs);
+    EXPECT_EQ(seen.epochs.size(), 1u);
+    EXPECT_EQ(seen.used["lidar"].size(), 101u);
+  }
 }
 
 TEST(EpochMonitor, MessagesOfALeadMayOvertakeEachOtherWhereThatIsAllowed) {

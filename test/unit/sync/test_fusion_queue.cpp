@@ -187,6 +187,31 @@ TEST(FusionQueue, AScanThatIsKnownOrBehindTheLastIsDroppedAndCounted) {
   EXPECT_EQ(queue.advance(0).size(), 1u);
 }
 
+TEST(FusionQueue, ACloudWithoutPointsWaitsForThoseBeforeItAlone) {
+  // Its header may be anywhere, also of a time that the queue has not heard of.
+  for (const StampNs stamp : {kStart, kStart + 100 * kMs, kStart - 20 * kNsPerSecond}) {
+    FusionQueue queue(twoCameras());
+    const auto empty = std::make_shared<Cloud>();
+    empty->stamp = empty->first_point_ns = stamp;
+    const StampNs t_ref = kStart + 50 * kMs;
+    queue.addCloud(cloudAt(kStart, t_ref), 0);
+    queue.addCloud(empty, 0);
+    queue.addReference(kStart, t_ref);
+    EXPECT_TRUE(queue.advance(0).empty());
+    for (int camera = 0; camera < 2; ++camera) queue.addSelection(kStart, camera, std::nullopt, 0);
+    const auto completed = queue.advance(0);
+    ASSERT_EQ(completed.size(), 2u);
+    EXPECT_EQ(completed[1].cloud, empty);
+    for (const auto& view : completed[1].views) {
+      EXPECT_EQ(view.state, ViewState::kNone);
+      EXPECT_FALSE(view.timed_out);
+    }
+    queue.addCloud(empty, 0);
+    EXPECT_EQ(queue.advance(0).size(), 1u);
+    EXPECT_EQ(queue.counters().out_of_order, 0u);
+  }
+}
+
 TEST(FusionQueue, AFastLidarWithADeadCameraLosesNothing) {
   for (const StampNs period : {100 * kMs, 10 * kMs, 1326 * kMs / 1000}) {  // to a packet a cloud
     FusionQueue queue(twoCameras());
