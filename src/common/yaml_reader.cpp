@@ -362,21 +362,23 @@ void YamlSection::readTexts(const std::string& key, std::vector<std::string>* va
   }
 }
 
-void YamlSection::numbers(const std::string& key, std::vector<double>* values,
+bool YamlSection::numbers(const std::string& key, std::vector<double>* values,
                           const NumberRange& range) {
-  if (present(key)) readNumbers(key, values, range);
+  const bool good = !present(key) || readNumbers(key, values, range);
   YamlTree list = YamlTree::list();
   for (const double value : *values) list.add(YamlTree::number(value));
   keep(key, std::move(list));
+  return good;
 }
 
-void YamlSection::readNumbers(const std::string& key, std::vector<double>* values,
+bool YamlSection::readNumbers(const std::string& key, std::vector<double>* values,
                               const NumberRange& range) {
   const YAML::Node list = node_[key];
   if (!list.IsSequence()) {
     problem(key, "must be a list of numbers");
-    return;
+    return false;
   }
+  bool good = true;
   values->clear();
   for (std::size_t i = 0; i < list.size(); ++i) {
     const YAML::Node item = list[i];
@@ -384,10 +386,12 @@ void YamlSection::readNumbers(const std::string& key, std::vector<double>* value
     if (read && within(*read, range)) {
       values->push_back(*read);
     } else {
+      good = false;
       problems_->push_back(pathOf(key) + "[" + std::to_string(i) + "] = " + describeValue(item) +
                            ": must be " + ruleOf(range));
     }
   }
+  return good;
 }
 
 int YamlSection::indexOfChoice(const std::string& key, const std::vector<std::string>& names,

@@ -194,7 +194,7 @@ RowBand readRows(YamlSection section) {
 void readTriple(YamlSection* section, const std::string& key, std::array<double, 3>* values,
                 double most) {
   std::vector<double> list(values->begin(), values->end());
-  section->numbers(key, &list, {-most, most});
+  if (!section->numbers(key, &list, {-most, most})) return;
   if (list.size() != values->size()) {
     section->problem(key, "must be three numbers, for x, y and z");
     return;

@@ -63,7 +63,8 @@ class YamlSection {
   /// Any scalar, as it is written.
   void text(const std::string& key, std::string* value);
   void texts(const std::string& key, std::vector<std::string>* values);
-  void numbers(const std::string& key, std::vector<double>* values, const NumberRange& range = {});
+  /// False if something of the list was no number within the range; it is a problem then.
+  bool numbers(const std::string& key, std::vector<double>* values, const NumberRange& range = {});
   /// One of some names; of several names for a value the first is the one in messages.
   template <typename Value>
   void choice(const std::string& key, Value* value,
@@ -95,7 +96,7 @@ class YamlSection {
  private:
   bool present(const std::string& key);
   void readTexts(const std::string& key, std::vector<std::string>* values);
-  void readNumbers(const std::string& key, std::vector<double>* values, const NumberRange& range);
+  bool readNumbers(const std::string& key, std::vector<double>* values, const NumberRange& range);
   int indexOfChoice(const std::string& key, const std::vector<std::string>& names,
                     const std::vector<std::string>& shown);
 
