@@ -3,7 +3,6 @@
 /// tf alone. Silent where the rig takes odometry from tf, and where somebody else tells tf where
 /// the vehicle is. All callbacks run one at a time.
 #include <geometry_msgs/TransformStamped.h>
-#include <ros/message_event.h>
 #include <tf2_msgs/TFMessage.h>
 
 #include <chrono>
@@ -11,10 +10,12 @@
 #include <memory>
 #include <optional>
 #include <pluginlib/class_list_macros.hpp>
+#include <set>
 #include <string>
 
 #include "base/fusion_nodelet.h"
 #include "edge/conversions.h"
+#include "edge/declared_lengths.h"
 #include "edge/tf_subscription.h"
 
 namespace semantic_lidar_fusion {
@@ -23,6 +24,8 @@ namespace {
 /// How long others have to show that they tell tf, from the first reading on.
 constexpr std::chrono::milliseconds kGrace{1000};
 constexpr int kDeepestTree = 100;
+/// Of what was broadcast, by which it is told from what others say of the same edge.
+constexpr std::size_t kOwnStamps = 10000;
 
 geometry_msgs::TransformStamped message(StampNs stamp, const std::string& parent,
                                         const std::string& child, const Transform& T_parent_child) {
@@ -48,8 +51,6 @@ class OdometryTfNodelet : public FusionNodelet {
   ~OdometryTfNodelet() override { stop(); }
 
  private:
-  using Event = ros::MessageEvent<const tf2_msgs::TFMessage>;
-
   void initialize() override {
     if (rig().odometry.source != OdometrySource::kTopic) {
       health().set("tf", "has the odometry already (odometry.source: tf)");
@@ -57,22 +58,23 @@ class OdometryTfNodelet : public FusionNodelet {
     }
     tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
     output_ = getNodeHandle().advertise<tf2_msgs::TFMessage>("/tf", 100);
-    const boost::function<void(const Event&)> store = [this](const Event& event) {
-      guard("tf", [&] { onTransforms(event); });
+    const auto store = [this](const tf2_msgs::TFMessageConstPtr& message) {
+      guard("tf", [&] { onTransforms(*message); });
     };
-    const auto hints = ros::TransportHints().tcpNoDelay();
-    static_ = getNodeHandle().subscribe<tf2_msgs::TFMessage>("/tf_static", 100, store,
-                                                             ros::VoidConstPtr(), hints);
-    moving_ = getNodeHandle().subscribe<tf2_msgs::TFMessage>("/tf", 100, store, ros::VoidConstPtr(),
-                                                             hints);
+    const auto damaged = [](const std::string&) {};  // TfSubscription says it
+    static_ = subscribeChecked<tf2_msgs::TFMessage>(getNodeHandle(), rig().tf_static_topic, 100,
+                                                    store, damaged);
+    moving_ =
+        subscribeChecked<tf2_msgs::TFMessage>(getNodeHandle(), rig().tf_topic, 100, store, damaged);
     startTicking();
   }
 
-  void onTransforms(const Event& event) {
-    const bool is_own = event.getPublisherName() == ros::this_node::getName();
-    for (const auto& transform : event.getMessage()->transforms) {
+  void onTransforms(const tf2_msgs::TFMessage& message) {
+    for (const auto& transform : message.transforms) {
       const std::string child = frameName(transform.child_frame_id);
-      if (is_own && child == told_root_) continue;
+      const bool is_own =
+          child == told_root_ && own_stamps_.count(stampNs(transform.header.stamp)) > 0;
+      if (is_own) continue;
       parents_[child] = frameName(transform.header.frame_id);
     }
   }
@@ -117,10 +119,12 @@ class OdometryTfNodelet : public FusionNodelet {
     auto output = boost::make_shared<tf2_msgs::TFMessage>();
     for (const StampedPose& reading : readings) {
       if (reading.stamp <= newest_) continue;
+      own_stamps_.insert(reading.stamp);
       output->transforms.push_back(
           message(reading.stamp, frameName(rig().fixed_frame), root, reading.T_fixed_vehicle * T));
     }
     newest_ = readings.back().stamp;
+    while (own_stamps_.size() > kOwnStamps) own_stamps_.erase(own_stamps_.begin());
     if (told_root_ != root) {
       told_root_ = root;
       NODELET_INFO_STREAM("tf from " << rig().fixed_frame << " to " << root << " is broadcast from "
@@ -134,6 +138,7 @@ class OdometryTfNodelet : public FusionNodelet {
   std::map<std::string, std::string> parents_;  ///< by child, but for what is broadcast here
   std::optional<Health::Clock::time_point> first_reading_;
   std::string told_root_;
+  std::set<StampNs> own_stamps_;
   StampNs newest_ = 0;  ///< that was broadcast
   bool is_told_elsewhere_ = false;
   ros::Publisher output_;

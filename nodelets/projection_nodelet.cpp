@@ -100,6 +100,7 @@ class ProjectionNodelet : public FusionNodelet {
           getNodeHandle(), inputTopic(camera.config, camera.config.camera_info), 8,
           [this, &camera](const sensor_msgs::CameraInfoConstPtr& info) {
             camera.geometry.update(*info);
+            if (!camera.geometry.info() || !camera.geometry.model()) return;
             rigWatch().lookAtInfo(static_cast<std::size_t>(camera.index), *camera.geometry.info(),
                                   *camera.geometry.model());
           },

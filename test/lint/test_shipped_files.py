@@ -154,22 +154,6 @@ def test_plugin_descriptions_match_the_exports():
     assert sorted(described) == sorted(exported)
 
 
-def test_subscriptions_do_not_wait_for_nagle():
-    """All subscriptions are made in two places, both with tcpNoDelay."""
-    places = set()
-    for path in files("nodelets/**/*.h") + files("nodelets/**/*.cpp"):
-        text = text_of(path)
-        found = len(
-            re.findall(r"\b(?:handle|transport)\.subscribe<|NodeHandle\(\)\.subscribe<", text)
-        )
-        if found:
-            places.add(os.path.basename(path))
-            assert "ros::TransportHints().tcpNoDelay()" in text
-            hinted = len(re.findall(r"ros::VoidConstPtr\(\),\s*(hints|ros::TransportHints)", text))
-            assert hinted == found, path
-    assert places == {"topic_connections.h", "tf_subscription.h"}
-
-
 def test_rostests_cannot_pass_by_default():
     """What rostest would forgive is not written: no <test>, no limit, a required node."""
     for path in files("test/ros/**/*.test"):

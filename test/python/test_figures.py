@@ -14,7 +14,7 @@ from semantic_lidar_fusion.rig import Rig  # noqa: E402
 from semantic_lidar_fusion.figures import paper_figures  # noqa: E402
 from semantic_lidar_fusion.cameras import Camera  # noqa: E402
 from semantic_lidar_fusion.bags.cloud_io import FUSED, OCCLUDED  # noqa: E402
-from semantic_lidar_fusion.errors import DataError  # noqa: E402
+from semantic_lidar_fusion.errors import ConfigError, DataError  # noqa: E402
 
 
 def info(model, coefficients, skew=0.0):
@@ -112,7 +112,7 @@ def test_rays_lead_back_through_a_lens_file(tmp_path):
     np.testing.assert_allclose(camera.rays(pixel), points / d1[:, None], atol=1e-9)
     assert np.isnan(camera.project(np.array([[0.0, 0.0, -1.0]]))[0]).all()
     path.write_text("{model: ds}")
-    with pytest.raises(DataError, match="model = ds: must be one of"):
+    with pytest.raises(ConfigError, match="model = ds: must be one of"):
         Camera(info("", []), lens={"file": str(path)})
 
 

@@ -835,9 +835,12 @@ def test_disk_full_at_the_very_end(room, fused, tmp_path):
         assert not leftovers(tmp_path)
 
 
-def started(room, folder):
+SLOW = ("--jobs", 1, "--set", "superpixels.scale=4", "--set", "superpixels.iterations=100")
+
+
+def started(room, folder, *options):
     """A run that has begun to write folder/out.bag."""
-    arguments = [room.bag, folder / "out.bag", "--rig", room.rig, "--all"]
+    arguments = [room.bag, folder / "out.bag", "--rig", room.rig, "--all"] + list(options)
     before = set(os.listdir(str(folder)))
     process = subprocess.Popen(
         [program()] + [str(a) for a in arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -934,7 +937,7 @@ def test_a_model_that_the_bags_scores_replace_is_said(room, tmp_path):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupt_leaves_nothing(room, tmp_path, number):
-    process = started(room, tmp_path)
+    process = started(room, tmp_path, *SLOW)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 128 + number, errors

@@ -38,9 +38,9 @@ def recorded_later(source, target, seconds):
     return target
 
 
-def assert_same_messages(a, b):
+def assert_same_messages(a, b, but=None):
     assert sorted(a.messages) == sorted(b.messages)
-    for topic in a.messages:
+    for topic in set(a.messages) - {but}:
         assert len(a.of(topic)) == len(b.of(topic)), topic
         for ours, theirs in zip(a.messages[topic], b.messages[topic]):
             assert ours == theirs, topic
@@ -69,7 +69,8 @@ def test_what_was_recorded_late_counts_the_same(drive, fused, tmp_path, seconds,
     result = run(bag, tmp_path / "out.bag", "--rig", drive.rig, "--jobs", "2")
     assert result.returncode == 0, result.stderr
     assert result.stderr.count("the bag is read again") == again
-    assert_same_messages(Fused(tmp_path / "out.bag", result), fused)
+    # tf is copied at the time of its record.
+    assert_same_messages(Fused(tmp_path / "out.bag", result), fused, but="/tf")
 
 
 def test_a_part_of_a_bag_comes_out_as_within_the_whole(drive):

@@ -33,7 +33,7 @@ def fused(drive, *options):
     messages = {}
     with rosbag.Bag(out) as opened:
         for topic, message, time in opened.read_messages():
-            if topic not in ("/class_info", "/configuration"):
+            if topic not in ("/class_info", "/configuration", "/tf", "/tf_static"):
                 assert time == message.header.stamp
             messages.setdefault(topic, []).append(message)
     return messages

@@ -34,7 +34,7 @@ def test_nothing_is_wrong_where_nothing_is_uncertain(tmp_path):
     bag, fused = tmp_path / "exact.bag", tmp_path / "fused.bag"
     simulate = [PROGRAMS[0], "--out", bag, "--duration", "0.3", "--scale", "0.3", "--quiet"]
     run(*(simulate + ["--exact", "--static", "--speed", "15"]))
-    run(PROGRAMS[1], bag, fused, "--rig", RIG, "--quiet")
+    run(PROGRAMS[1], bag, fused, "--rig", RIG, "--quiet", "--set", "smoothing.iterations=0")
     rig = Rig.load(RIG)
     truth = scoring.Truth(str(bag), len(rig.labels))
     clouds = scoring.FusedBag(str(fused), rig.labels.names)

@@ -305,7 +305,9 @@ def _as_good(
 ) -> Tuple[float, float]:
     """The middle and half the length of the stretch around x on which the lift, with the best height
     for each pitch, is as good as the best."""
-    heights = np.linspace(-MAX_HEIGHT_M, MAX_HEIGHT_M, 5) if axis == PITCH else [x[HEIGHT]]
+    heights = [float(x[HEIGHT])]
+    if axis == PITCH:
+        heights = [float(h) for h in np.linspace(-MAX_HEIGHT_M, MAX_HEIGHT_M, 5)]
 
     def is_good(by: float) -> bool:
         y = _moved(x, axis, by)
