@@ -2,7 +2,6 @@
 /// An odometry topic -> tf from the rig's fixed frame to the vehicle, for RViz and maps, which know
 /// tf alone. Silent where the rig takes odometry from tf, and where somebody else tells tf where
 /// the vehicle is. All callbacks run one at a time.
-#include <geometry_msgs/TransformStamped.h>
 #include <tf2_msgs/TFMessage.h>
 
 #include <chrono>
@@ -26,23 +25,6 @@ constexpr std::chrono::milliseconds kGrace{1000};
 constexpr int kDeepestTree = 100;
 /// Of what was broadcast, by which it is told from what others say of the same edge.
 constexpr std::size_t kOwnStamps = 10000;
-
-geometry_msgs::TransformStamped message(StampNs stamp, const std::string& parent,
-                                        const std::string& child, const Transform& T_parent_child) {
-  geometry_msgs::TransformStamped result;
-  result.header.stamp.fromNSec(static_cast<std::uint64_t>(stamp));
-  result.header.frame_id = parent;
-  result.child_frame_id = child;
-  result.transform.translation.x = T_parent_child.translation().x();
-  result.transform.translation.y = T_parent_child.translation().y();
-  result.transform.translation.z = T_parent_child.translation().z();
-  const Eigen::Quaterniond q(T_parent_child.linear());
-  result.transform.rotation.x = q.x();
-  result.transform.rotation.y = q.y();
-  result.transform.rotation.z = q.z();
-  result.transform.rotation.w = q.w();
-  return result;
-}
 
 }  // namespace
 
@@ -120,8 +102,8 @@ class OdometryTfNodelet : public FusionNodelet {
     for (const StampedPose& reading : readings) {
       if (reading.stamp <= newest_) continue;
       own_stamps_.insert(reading.stamp);
-      output->transforms.push_back(
-          message(reading.stamp, frameName(rig().fixed_frame), root, reading.T_fixed_vehicle * T));
+      output->transforms.push_back(stampedTransform(frameName(rig().fixed_frame), root,
+                                                    reading.stamp, reading.T_fixed_vehicle * T));
     }
     newest_ = readings.back().stamp;
     while (own_stamps_.size() > kOwnStamps) own_stamps_.erase(own_stamps_.begin());

@@ -433,4 +433,23 @@ Transform transform(const geometry_msgs::Pose& message) {
                      message.orientation.z);
 }
 
+geometry_msgs::TransformStamped stampedTransform(const std::string& parent,
+                                                 const std::string& child, StampNs stamp,
+                                                 const Transform& T_parent_child) {
+  geometry_msgs::TransformStamped message;
+  message.header.frame_id = parent;
+  message.header.stamp = rosTime(stamp);
+  message.child_frame_id = child;
+  const Eigen::Vector3d p = T_parent_child.translation();
+  const Eigen::Quaterniond q(T_parent_child.linear());
+  message.transform.translation.x = p.x();
+  message.transform.translation.y = p.y();
+  message.transform.translation.z = p.z();
+  message.transform.rotation.w = q.w();
+  message.transform.rotation.x = q.x();
+  message.transform.rotation.y = q.y();
+  message.transform.rotation.z = q.z();
+  return message;
+}
+
 }  // namespace semantic_lidar_fusion

@@ -7,6 +7,7 @@
 
 #include <geometry_msgs/Pose.h>
 #include <geometry_msgs/Transform.h>
+#include <geometry_msgs/TransformStamped.h>
 #include <sensor_msgs/CameraInfo.h>
 #include <sensor_msgs/CompressedImage.h>
 #include <sensor_msgs/Image.h>
@@ -88,5 +89,9 @@ std::string normNote(const geometry_msgs::Quaternion& rotation);
 /// Throws DataError if a number is not finite or the quaternion is no rotation.
 Transform transform(const geometry_msgs::Transform& message);
 Transform transform(const geometry_msgs::Pose& message);
+/// For tf: frame `child` in frame `parent` at `stamp`. Throws DataError as rosTime does.
+geometry_msgs::TransformStamped stampedTransform(const std::string& parent,
+                                                 const std::string& child, StampNs stamp,
+                                                 const Transform& T_parent_child);
 
 }  // namespace semantic_lidar_fusion

@@ -58,25 +58,6 @@ bool differ(const Transform& a, const Transform& b) {
          Eigen::Quaterniond(a.linear()).angularDistance(Eigen::Quaterniond(b.linear())) > 1e-3;
 }
 
-geometry_msgs::TransformStamped stampedTransform(const std::string& parent,
-                                                 const std::string& child, StampNs stamp,
-                                                 const Transform& T_parent_child) {
-  geometry_msgs::TransformStamped message;
-  message.header.frame_id = parent;
-  message.header.stamp = rosTime(stamp);
-  message.child_frame_id = child;
-  const Eigen::Vector3d p = T_parent_child.translation();
-  const Eigen::Quaterniond q(T_parent_child.linear());
-  message.transform.translation.x = p.x();
-  message.transform.translation.y = p.y();
-  message.transform.translation.z = p.z();
-  message.transform.rotation.w = q.w();
-  message.transform.rotation.x = q.x();
-  message.transform.rotation.y = q.y();
-  message.transform.rotation.z = q.z();
-  return message;
-}
-
 void checkPlace(const Eigen::Vector3d& translation, double largest_m) {
   if (translation.cwiseAbs().maxCoeff() <= largest_m) return;
   char text[120];
