@@ -45,8 +45,10 @@ class Recovery(unittest.TestCase):
         live.wait_until(came, "a cloud with fused points", timeout)
         return time.monotonic() - start
 
-    def wait_for_bonds(self, count):
-        """Returns when `count` nodelets and their loaders have heard of each other."""
+    def wait_for_bonds(self):
+        """Returns when all nodelets of the manager and their loaders have heard of each other."""
+        publishers = dict(rospy.get_master().getSystemState()[2][0])[live.MANAGER + "/bond"]
+        count = len(publishers) - 1  # a loader of each nodelet, and the manager
         status = live.Received(live.MANAGER + "/bond", live.BOND_STATUS)
 
         # The third: upstream, a bond watches for silence from the second heartbeat on.
@@ -62,7 +64,7 @@ class Recovery(unittest.TestCase):
         with live.launched("fusion.launch", rig=self.made.rig, bond="true"):
             live.wait_for_chain(self.feed.topics, rospy.get_name())
             self.wait_for_fused_cloud(30.0)
-            self.wait_for_bonds(4)
+            self.wait_for_bonds()
             pid = live.pid_of(live.MANAGER)
             os.kill(pid, signal.SIGKILL)
             took = self.wait_for_fused_cloud(RECOVERY_S)
