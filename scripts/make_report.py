@@ -19,8 +19,9 @@ def make_parser():
         "--out", metavar="FILE", help="the page to write (default: FUSED.html beside the bag)"
     )
     parser.add_argument(
-        "--fixed-frame", default="odom", metavar="FRAME", help="of the map (default: odom)"
+        "--fixed-frame", metavar="FRAME", help="of the map (default: that of the bag's own rig)"
     )
+    parser.add_argument("--quiet", action="store_true", help="do not name the page that is written")
     return parser
 
 
@@ -35,7 +36,8 @@ def main():
     parts = ["<h1>%s</h1>" % html_report.html.escape(title)]
     parts += html_report.bag_parts(options.bag, options.fixed_frame)
     write_text(out, html_report.page(title, parts))
-    print("%s: %.1f MB" % (out, os.path.getsize(out) / 1e6))
+    if not options.quiet:
+        print("%s: %.1f MB" % (out, os.path.getsize(out) / 1e6))
 
 
 if __name__ == "__main__":

@@ -57,6 +57,23 @@ def test_a_page_of_a_bag(room, tmp_path, run_command):
     assert spans[0] <= 2 * bag_factory.ROOM_X + 0.3 and spans[1] <= 2 * bag_factory.ROOM_Y + 0.3
 
 
+def test_fuse_bag_writes_the_page_of_each_output(room, tmp_path):
+    made, _ = room
+    first, second = tmp_path / "a.html", tmp_path / "-b.html"
+    other = tmp_path / "other.bag"
+    made.fuse("--report", first, "--also", other, "--set=keep_unlabelled=false", "--report", second)
+    shown = [page.read_text() for page in (first, second)]
+    assert "<td>fused</td>" in shown[0] and "out.bag" in shown[0]
+    assert "keep_unlabelled: false" in shown[1] and "keep_unlabelled: false" not in shown[0]
+    assert len(data_of(shown[1])["sets"]) == 2  # in the fixed frame of the bag's own rig
+
+    wrong = made.fuse("--report", tmp_path / "page.bag", expect=2)
+    assert "must be a file name that ends in .html" in wrong.stderr
+    failed = made.fuse("--quiet", "--report", tmp_path / "none" / "page.html", expect=1)
+    assert "the folder" in failed.stderr and "page.html: is not written" in failed.stderr
+    assert failed.stdout == ""
+
+
 def test_markdown_becomes_html():
     text = "# A <b>\n\nIt is `x < 1`.\n\n" + tables.markdown(["class", "F1"], [["Road", "0.5"]])
     page = html_report.from_markdown(text)

@@ -3,7 +3,7 @@
 #include <malloc.h>
 #include <sys/stat.h>
 
-#include <cstdio>
+#include <algorithm>
 #include <string>
 
 #include "edge/version.h"
@@ -12,6 +12,7 @@
 #include "tools/common/command_line.h"
 #include "tools/fuse_bag/bag_fusion.h"
 #include "tools/fuse_bag/fuse_bag_options.h"
+#include "tools/fuse_bag/report_page.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -34,11 +35,8 @@ void reuseMemory() {
 #endif
 }
 
-void fuse(const FuseBagOptions& options) {
-  if (options.print_rig) {
-    printText(configurationText(loadRig(options.rig, options.outputs.front().overrides)));
-    return;
-  }
+/// No output is an input or another output.
+void checkNames(const FuseBagOptions& options) {
   for (auto output = options.outputs.begin(); output != options.outputs.end(); ++output) {
     for (const std::string& input : options.inputs) {
       if (sameFile(input, output->path)) throw Error(output->path + ": is the input bag itself");
@@ -47,10 +45,28 @@ void fuse(const FuseBagOptions& options) {
       if (sameFile(other->path, output->path)) throw Error(output->path + ": is given twice");
     }
   }
+}
+
+bool wantsReport(const FuseBagOptions& options) {
+  return std::any_of(options.outputs.begin(), options.outputs.end(),
+                     [](const OutputOptions& output) { return !output.report.empty(); });
+}
+
+void fuse(const FuseBagOptions& options) {
+  if (options.print_rig) {
+    printText(configurationText(loadRig(options.rig, options.outputs.front().overrides)));
+    return;
+  }
+  checkNames(options);
+  const std::string report_program = wantsReport(options) ? reportProgram() : "";
   reuseMemory();
   BagFusion fusion(options, endIfInterrupted);
   fusion.run();
   if (!options.quiet) printText(fusion.summary());
+  for (const OutputOptions& output : options.outputs) {
+    if (output.report.empty()) continue;
+    writeReport(report_program, output.path, output.report, options.quiet);
+  }
   const std::string failure = fusion.whyNothingIsFused();
   if (!failure.empty()) throw Error(failure);
 }

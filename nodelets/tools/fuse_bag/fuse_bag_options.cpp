@@ -35,9 +35,13 @@ options:
   --no-tf          leave out /tf and /tf_static, without which OUT.bag shows and maps by itself
   --truth visibility
                    let the bag's /points_truth, and no mask, say which camera sees which point
-  --also OUT2.bag  make a second output, and so on: the options --set and --truth behind it are its
-                   own, those before it are not. Outputs that differ in what comes after the images
-                   (motion, odometry.lookup, on_missing and max_extrapolation, uncertainty,
+  --report FILE.html
+                   also a page about OUT.bag for a browser, with all in one file: points by status
+                   and class, scan by scan, a view of a scan and of the map, the settings
+                   (make_report.py makes it of any fused bag)
+  --also OUT2.bag  make a second output, and so on: the options --set, --truth and --report behind it
+                   are its own, those before it are not. Outputs that differ in what comes after the
+                   images (motion, odometry.lookup, on_missing and max_extrapolation, uncertainty,
                    occlusion, overlap, smoothing, keep_unlabelled) share the work on the bag and its
                    images
   --start S        fuse the scans recorded from S seconds after the first message on
@@ -71,9 +75,18 @@ FuseBagOptions parseFuseBagOptions(const std::vector<std::string>& arguments) {
       throw UsageError("--truth is '" + value + "'; it must be visibility");
     options.outputs.back().true_visibility = true;
   });
+  reader.value("--report", [&](const std::string& value) {
+    constexpr char kEnding[] = ".html";
+    if (value.size() < sizeof(kEnding) ||
+        value.compare(value.size() + 1 - sizeof(kEnding), std::string::npos, kEnding) != 0) {
+      throw UsageError("--report is '" + value + "'; it must be a file name that ends in .html");
+    }
+    options.outputs.back().report = value;
+  });
   reader.value("--also", [&](const std::string& value) {
     if (value.empty()) throw UsageError("--also needs the name of a bag");
-    options.outputs.push_back({value, {}, false});
+    options.outputs.emplace_back();
+    options.outputs.back().path = value;
   });
   reader.number("--start", 0.0, kLongestBagS, &options.start_s);
   reader.number("--end", 0.0, kLongestBagS, &end_s);

@@ -15,6 +15,7 @@ struct OutputOptions {
   std::string path;
   std::vector<std::string> overrides;  ///< --set key=value
   bool true_visibility = false;        ///< --truth visibility
+  std::string report;                  ///< --report FILE.html; empty: none
 };
 
 struct FuseBagOptions : CommonOptions {

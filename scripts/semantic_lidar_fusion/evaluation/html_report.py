@@ -19,7 +19,7 @@ from semantic_lidar_fusion.bags.cloud_io import FUSED, SemanticCloud, xyz
 from semantic_lidar_fusion.bags.poses import TransformTree, transform_points
 from semantic_lidar_fusion.errors import DataError
 from semantic_lidar_fusion.labels import NO_LABEL, LabelSet
-from semantic_lidar_fusion.rig import CONFIGURATION_TOPIC
+from semantic_lidar_fusion.rig import CONFIGURATION_TOPIC, Rig
 
 STATUS_NAMES = ("fused", "occluded", "outside", "no image", "no odometry")
 STATUS_COLORS = ("#2b7a4b", "#c98a1b", "#9aa3ad", "#7b5ea7", "#c0392b")
@@ -320,10 +320,14 @@ def scan_points(story: BagStory) -> Points:
     return _points_of(cloud, name, xyz(cloud.points), slice(None, None, max(step, 1)))
 
 
-def map_points(story: BagStory, fixed_frame: str = "odom") -> Optional[Points]:
-    """Fused points of scans laid over each other, one for each cell; None where tf does not tell."""
+def map_points(story: BagStory, fixed_frame: Optional[str] = None) -> Optional[Points]:
+    """Fused points of scans laid over each other, one for each cell; None where tf does not tell.
+    `fixed_frame`: default: that of the bag's own rig, else odom."""
     with BagReader(story.path) as bag:
         tree = TransformTree.from_bag(bag)
+        if fixed_frame is None:
+            rig = Rig.from_bag(bag)
+            fixed_frame = rig.text("fixed_frame") if rig else "odom"
     step = max(1, len(story.scans) // 60)
     kept: List[Points] = []
     with Clouds(story.path) as clouds:
@@ -508,7 +512,9 @@ pre{overflow-x:auto;font-size:.75rem;background:#f3f5f7;padding:.6rem}code{backg
 """
 
 
-def bag_parts(path: str, fixed_frame: str = "odom", known: Optional[LabelSet] = None) -> List[str]:
+def bag_parts(
+    path: str, fixed_frame: Optional[str] = None, known: Optional[LabelSet] = None
+) -> List[str]:
     """All that a fused bag tells by itself."""
     story = read_story(path, known)
     sets = [scan_points(story)]
