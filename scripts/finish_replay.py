@@ -40,7 +40,16 @@ def main():
     from semantic_lidar_fusion.bags import replay
 
     atexit.register(replay.end_launch)  # after an error's line too
-    replay.finish(options)
+    replay.finish(
+        replay.Finish(
+            rig=options.rig,
+            overrides=options.overrides.split(),
+            recorded=options.recorded,
+            evaluate=options.evaluate or "",
+            bag=options.bag or "",
+            player_within_s=options.player_within,
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -39,7 +39,16 @@ def main():
     cli.require("numpy", "yaml", "rospy", "rosgraph", "genpy")
     from semantic_lidar_fusion.bags import replay
 
-    replay.start(options)
+    replay.start(
+        replay.Start(
+            rig=options.rig,
+            overrides=options.overrides.split(),
+            manager=options.manager,
+            recorded=options.recorded,
+            within_s=options.within,
+            player_within_s=options.player_within,
+        )
+    )
 
 
 if __name__ == "__main__":

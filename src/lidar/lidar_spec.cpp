@@ -10,8 +10,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kRadPerDeg = kPi / 180.0;
-
 constexpr StampNs kPuckLaserNs = 2304;
 constexpr StampNs kPuckFiringNs = 55296;
 constexpr StampNs kHdlLaserNs = 1152;

@@ -20,7 +20,6 @@ constexpr double kThetaSlack_rad = 2e-6;
 /// Longest distance from the image's corner, as the lens' equation counts, that single precision
 /// gives to 0.02 px.
 constexpr double kMostSinglePrecision_px = 10000.0;
-constexpr double kHalfTurn_rad = 3.14159265358979323846;
 
 const ProjectionKernels& kernels() {
   static const ProjectionKernelList list = usableProjectionKernels();
@@ -223,7 +222,7 @@ SightCone sightCone(const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>& image_fr
     const double side = rows.down ? camera.imageSize().height : camera.imageSize().width;
     const double longest_s = std::max(std::abs(rows.at_zero_s - rows.per_px_s * side),
                                       std::abs(rows.at_zero_s + 2.0 * rows.per_px_s * side));
-    theta_rad = std::min(kHalfTurn_rad, theta_rad + longest_s * motion->turn.norm());
+    theta_rad = std::min(kPi, theta_rad + longest_s * motion->turn.norm());
     moved_m = longest_s * motion->velocity.norm();
   }
   SightCone cone;

@@ -22,6 +22,7 @@ using Transform = Eigen::Isometry3d;
 
 constexpr StampNs kNsPerSecond = 1000000000;
 constexpr double kPi = 3.14159265358979323846;
+constexpr double kRadPerDeg = kPi / 180.0;
 
 inline double toSeconds(StampNs duration_ns) { return static_cast<double>(duration_ns) * 1e-9; }
 /// Nearest nanosecond.

@@ -7,7 +7,6 @@ namespace semantic_lidar_fusion {
 namespace simulator {
 namespace {
 
-constexpr double kRadPerDeg = 3.14159265358979323846 / 180.0;
 // What a key is for.
 constexpr std::uint64_t kPoses = 0xE81, kLenses = 0xE82, kStamps = 0xE83;
 

@@ -12,7 +12,6 @@ namespace {
 constexpr double kSpeedScaleSigma = 0.005, kSpeedSigma = 0.03;    // of the speed; m/s
 constexpr double kYawBiasSigma = 8.7e-4, kYawRateSigma = 2.6e-3;  // rad/s
 constexpr double kTiltSigma = 5e-4;                               // rad
-constexpr double kRadPerDeg = 3.14159265358979323846 / 180.0;
 
 }  // namespace
 

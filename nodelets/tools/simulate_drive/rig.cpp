@@ -7,8 +7,6 @@ namespace semantic_lidar_fusion {
 namespace simulator {
 namespace {
 
-constexpr double kRadPerDeg = kPi / 180.0;
-
 struct Mount {
   const char* name;
   const char* frame;

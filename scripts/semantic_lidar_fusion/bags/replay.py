@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import xmlrpc.client
+from dataclasses import dataclass
 from typing import Any, Callable, Dict, List, Optional, Set, Tuple
 
 import genpy.dynamic
@@ -139,38 +140,49 @@ def _summary(reports: Reports, topic: str) -> str:
     return "\n".join(lines)
 
 
-def _evaluate(options: Any, recorded: str, settings: list) -> None:
+@dataclass(frozen=True)
+class Finish:
+    """What finish_replay.py is asked for; empty: not wanted."""
+
+    rig: str
+    overrides: List[str]  # of the rig file, key=value
+    recorded: str  # the bag that the node `recorder` writes
+    evaluate: str  # the folder of the tables
+    bag: str  # that is played, with points_truth
+    player_within_s: float
+
+
+def _evaluate(wanted: Finish, recorded: str) -> None:
     command = [
         sys.executable,
         os.path.join(os.path.dirname(os.path.abspath(sys.argv[0])), "evaluate.py"),
-        options.bag,
-        "--rig=" + options.rig,
+        wanted.bag,
+        "--rig=" + wanted.rig,
         "--clouds=%s=%s" % (PACKAGE, recorded),
-        "--out=" + options.evaluate,
+        "--out=" + wanted.evaluate,
         "--force",
     ]
-    command += ["--set=" + setting for setting in settings]
+    command += ["--set=" + setting for setting in wanted.overrides]
     if subprocess.run(command).returncode != 0:
         raise DataError("%s: the evaluation failed, see above" % recorded)
 
 
-def finish(options: Any) -> None:
-    """Waits for the end, then does what the options of finish_replay.py ask for."""
-    settings = options.overrides.split()
-    rig = Rig.load(options.rig, settings)
+def finish(wanted: Finish) -> None:
+    """Waits for the end, then does what is wanted."""
+    rig = Rig.load(wanted.rig, wanted.overrides)
     rospy.init_node("finish_replay", disable_signals=False)
     reports = Reports()
     player, output = rospy.resolve_name("player"), rospy.resolve_name("points_semantic")
-    if not _wait(lambda: _node(player), options.player_within):
+    if not _wait(lambda: _node(player), wanted.player_within_s):
         raise DataError("%s does not run: can the bag be read? See its message above" % player)
     _wait(lambda: _node(player) is None)
     _wait_for_last_scans(reports, output, _longest_wait_s(rig))
     print(_summary(reports, output))
     sys.stdout.flush()
-    if options.recorded:
-        recorded = _end_recorder(options.recorded)
-        if options.evaluate:
-            _evaluate(options, recorded, settings)
+    if wanted.recorded:
+        recorded = _end_recorder(wanted.recorded)
+        if wanted.evaluate:
+            _evaluate(wanted, recorded)
 
 
 def end_launch() -> None:
@@ -227,27 +239,39 @@ def _missing_links(player: str, manager: str, rig: Rig, recorded: bool) -> List[
     return missing
 
 
-def start(options: Any) -> None:
-    """Lets the waiting player go once chain and recorder are connected; see start_replay.py."""
-    rig = Rig.load(options.rig, options.overrides.split())
+@dataclass(frozen=True)
+class Start:
+    """What start_replay.py is asked for."""
+
+    rig: str
+    overrides: List[str]  # of the rig file, key=value
+    manager: str  # the nodelet manager
+    recorded: bool  # wait for the node `recorder` too
+    within_s: float  # after this the bag is played anyway
+    player_within_s: float
+
+
+def start(wanted: Start) -> None:
+    """Lets the waiting player go once chain and recorder are connected."""
+    rig = Rig.load(wanted.rig, wanted.overrides)
     rospy.init_node("start_replay", disable_signals=False)
-    player, manager = rospy.resolve_name("player"), rospy.resolve_name(options.manager)
-    if not _wait(lambda: _node(player), options.player_within):
+    player, manager = rospy.resolve_name("player"), rospy.resolve_name(wanted.manager)
+    if not _wait(lambda: _node(player), wanted.player_within_s):
         raise DataError("%s does not run: can the bag be read? See its message above" % player)
     missing: List[str] = []
 
     def is_connected() -> bool:
         nonlocal missing
-        missing = _missing_links(player, manager, rig, options.recorded)
+        missing = _missing_links(player, manager, rig, wanted.recorded)
         return not missing
 
     # Twice: a subscription may be made between two looks.
-    connected = _wait(is_connected, options.within) and _wait(is_connected, options.within)
+    connected = _wait(is_connected, wanted.within_s) and _wait(is_connected, wanted.within_s)
     if not connected:
         rospy.logwarn("the bag is played though not connected: %s", ", ".join(missing))
     name = player + "/pause_playback"
     try:
-        rospy.wait_for_service(name, options.player_within)
+        rospy.wait_for_service(name, wanted.player_within_s)
         done = rospy.ServiceProxy(name, _set_bool())(False).success
     except (rospy.ROSException, rospy.ServiceException) as error:
         raise DataError("%s does not start: %s" % (player, error)) from error
