@@ -6,6 +6,7 @@ import os
 import resource
 import shlex
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -741,6 +742,37 @@ def test_damaged_bag_ends_with_an_error_or_a_whole_output(room, tmp_path):
             rosbag.Bag(str(out)).close()
         else:
             assert not out.exists()
+
+
+def test_an_index_or_a_record_that_leads_beyond_its_chunk_costs_one_message(room, tmp_path):
+    data = bytearray(room.bag.read_bytes())
+    huge = (2**30).to_bytes(4, "little")
+    with rosbag.Bag(str(room.bag)) as bag:
+        topics = {c.topic: c.id for c in bag._get_connections()}
+
+        def place(topic, number):
+            """Bytes of an index entry, and where its record begins in the file."""
+            entry = sorted(bag._connection_indexes[topics[topic]])[number]
+            index = struct.pack("<III", entry.time.secs, entry.time.nsecs, entry.offset)
+            return index, bag._chunk_headers[entry.chunk_pos].data_pos + entry.offset
+
+        index, _ = place("/tf", 3)
+        at = data.index(index)
+        data[at + 8 : at + 12] = huge
+        _, scan = place("/points", 1)
+        data[scan : scan + 4] = huge  # length of the record's header
+        _, info = place("/left/camera_info", 0)
+        data[info + 4 : info + 8] = huge  # length of its first field
+        _, scores = place("/front/scores", 2)
+        header = int.from_bytes(data[scores : scores + 4], "little")
+        data[scores + 4 + header : scores + 8 + header] = huge  # length of the message
+    (tmp_path / "bad.bag").write_bytes(bytes(data))
+    result = run(tmp_path / "bad.bag", tmp_path / "out.bag", "--rig", room.rig)
+    assert result.returncode == 0, result.stderr
+    assert "2 scans of 3" in result.stdout
+    for counted in ("/tf", "/left/camera_info", "/front/scores"):
+        assert "counted: %s: unusable message: 1" % counted in result.stdout
+    assert "counted: scans: unusable: 1" in result.stdout
 
 
 def test_unindexed_bag(room, tmp_path):

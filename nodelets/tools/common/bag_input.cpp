@@ -13,6 +13,62 @@
 namespace semantic_lidar_fusion {
 namespace {
 
+// Where a message stands, and the chunk around it, are known to rosbag alone; an explicit
+// instantiation may name what is private.
+template <typename Tag, typename Tag::Member kMember>
+struct Named {
+  friend typename Tag::Member member(Tag) { return kMember; }
+};
+struct PlaceOfMessage {
+  using Member = const rosbag::IndexEntry rosbag::MessageInstance::*;
+  friend Member member(PlaceOfMessage);
+};
+struct BagOfMessage {
+  using Member = const rosbag::Bag* rosbag::MessageInstance::*;
+  friend Member member(BagOfMessage);
+};
+struct ReadChunk {
+  using Member = void (rosbag::Bag::*)(std::uint64_t) const;
+  friend Member member(ReadChunk);
+};
+struct ChunkThatIsRead {
+  using Member = rosbag::Buffer* rosbag::Bag::*;
+  friend Member member(ChunkThatIsRead);
+};
+template struct Named<PlaceOfMessage, &rosbag::MessageInstance::index_entry_>;
+template struct Named<BagOfMessage, &rosbag::MessageInstance::bag_>;
+template struct Named<ReadChunk, &rosbag::Bag::decompressChunk>;
+template struct Named<ChunkThatIsRead, &rosbag::Bag::current_buffer_>;
+
+/// A range of bytes that is read from its front; each part is a length and as many bytes.
+struct Bytes {
+  const std::uint8_t* data;
+  std::size_t size;
+
+  /// Takes the part at the front; false where not all of it is there.
+  bool take(Bytes* part) {
+    std::uint32_t length = 0;
+    if (size < sizeof(length)) return false;
+    std::memcpy(&length, data, sizeof(length));
+    if (size - sizeof(length) < length) return false;
+    *part = {data + sizeof(length), length};
+    data += sizeof(length) + length;
+    size -= sizeof(length) + length;
+    return true;
+  }
+};
+
+/// Whether the header of a record is that of a message: fields "name=value", one of them op=2.
+bool isHeaderOfMessage(Bytes header) {
+  static const std::string kOperation = "op=\x02";
+  bool is_message = false;
+  for (Bytes field{}; header.size > 0;) {
+    if (!header.take(&field)) return false;
+    is_message = is_message || std::string(field.data, field.data + field.size) == kOperation;
+  }
+  return is_message;
+}
+
 /// What rosbag says badly or not at all.
 void checkFile(const std::string& path) {
   struct stat status {};
@@ -23,6 +79,25 @@ void checkFile(const std::string& path) {
 }
 
 }  // namespace
+
+std::tuple<const rosbag::Bag*, std::uint64_t, std::uint32_t> placeOf(
+    const rosbag::MessageInstance& message) {
+  const rosbag::IndexEntry& entry = message.*member(PlaceOfMessage());
+  return {message.*member(BagOfMessage()), entry.chunk_pos, entry.offset};
+}
+
+void checkRecord(const rosbag::MessageInstance& message) {
+  const auto [bag, chunk, offset] = placeOf(message);
+  if (bag->getMajorVersion() < 2) return;  // those bags have no chunks
+  (bag->*member(ReadChunk()))(chunk);
+  rosbag::Buffer* buffer = bag->*member(ChunkThatIsRead());
+  const std::size_t begin = std::min(offset, buffer->getSize());
+  Bytes rest{buffer->getData() + begin, buffer->getSize() - begin};
+  Bytes header{}, data{};
+  if (!rest.take(&header) || !isHeaderOfMessage(header) || !rest.take(&data)) {
+    throw DataError("is damaged: the bag's index leads to no whole message");
+  }
+}
 
 std::string bareTopic(const std::string& topic) {
   const std::size_t begin = topic.find_first_not_of('/');

@@ -11,6 +11,7 @@
 #include <deque>
 #include <map>
 #include <string>
+#include <tuple>
 #include <vector>
 
 #include "edge/declared_lengths.h"
@@ -22,10 +23,21 @@ struct StampedMessage {
   std_msgs::Header header;
 };
 
+/// Where a message stands: its bag, the position of its chunk in the file, and that within the
+/// chunk.
+std::tuple<const rosbag::Bag*, std::uint64_t, std::uint32_t> placeOf(
+    const rosbag::MessageInstance& message);
+
+/// Throws DataError where a damaged index or record leads beyond the message's chunk: rosbag reads
+/// there whatever memory follows.
+void checkRecord(const rosbag::MessageInstance& message);
+
 /// A message of a bag. Null where the bag has another definition of the type. Throws DataError
-/// where the message declares more than it holds, before that is allocated.
+/// where its record is damaged, and where the message declares more than it holds, before that is
+/// allocated.
 template <class M>
 boost::shared_ptr<M> messageOf(const rosbag::MessageInstance& message) {
+  checkRecord(message);
   if (!message.instantiate<DeclaredLengths<M>>()) return nullptr;
   return message.instantiate<M>();
 }

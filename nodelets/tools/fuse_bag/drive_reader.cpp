@@ -20,23 +20,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-// Where a message stands is known to rosbag alone; an explicit instantiation may name what is
-// private.
-template <typename Tag, typename Tag::Member kMember>
-struct Named {
-  friend typename Tag::Member member(Tag) { return kMember; }
-};
-struct PlaceOfMessage {
-  using Member = const rosbag::IndexEntry rosbag::MessageInstance::*;
-  friend Member member(PlaceOfMessage);
-};
-struct BagOfMessage {
-  using Member = const rosbag::Bag* rosbag::MessageInstance::*;
-  friend Member member(BagOfMessage);
-};
-template struct Named<PlaceOfMessage, &rosbag::MessageInstance::index_entry_>;
-template struct Named<BagOfMessage, &rosbag::MessageInstance::bag_>;
-
 using Handler = std::function<void(const rosbag::MessageInstance&)>;
 
 /// The topic as the bag has it; empty (and `problem` filled) if it is absent or of another type.
@@ -362,12 +345,11 @@ void DriveReader::findTogether() {
     const rosbag::MessageInstance& message = **next_;
     if (message.getTime().toSec() > time_.toSec() + kTogetherS) break;
     together_until_ = message.getTime();
-    const rosbag::Bag* bag = message.*member(BagOfMessage());
+    const auto [bag, chunk, offset] = placeOf(message);
     const auto known = std::find(bags.begin(), bags.end(), bag);
     const auto number = static_cast<std::size_t>(known - bags.begin());
     if (known == bags.end()) bags.push_back(bag);
-    const rosbag::IndexEntry& entry = message.*member(PlaceOfMessage());
-    const PlaceInBags place(number, entry.chunk_pos, entry.offset);
+    const PlaceInBags place(number, chunk, offset);
     const auto [topic, is_first] = last.emplace(message.getTopic(), place);
     is_orderly = is_orderly && (is_first || topic->second < place);
     topic->second = place;

@@ -78,7 +78,7 @@ void ProductWriter::writeOverlays(const FusionResult& result,
 
 void ProductWriter::copyTransforms(const std::vector<rosbag::MessageInstance>& transforms) {
   for (const rosbag::MessageInstance& message : transforms) {
-    const auto value = message.instantiate<tf2_msgs::TFMessage>();
+    const auto value = messageOf<tf2_msgs::TFMessage>(message);
     if (!value) continue;
     const StampNs time = stampNs(message.getTime());
     if (bareTopic(message.getTopic()) == bareTopic(rig_.tf_static_topic)) {
