@@ -4,6 +4,8 @@
 # threads, file descriptors, losses and latency. Exit code 0 only if every limit holds.
 #
 #   scripts/soak.sh MINUTES [options]
+#   scripts/soak.sh --hostile MINUTES      good drives between attacks (test/hostile.py); of the
+#                                          options only --build-dir
 #     --bag FILE         the bag to loop (default: a simulated drive)
 #     --rig FILE         its rig file (default: config/demo.yaml, the simulated drive's)
 #     --scale S          image size of the simulated drive, 1 = 1920x1208 (default: 0.5)
@@ -23,14 +25,14 @@ set -euo pipefail
 PATH=/usr/sbin:/usr/bin:/sbin:/bin
 source_dir=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
-usage() { sed -n '3,22s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
+usage() { sed -n '3,24s/^# \{0,1\}//p' "${BASH_SOURCE[0]}"; }
 fail() {
   echo "soak.sh: $*" >&2
   exit 2
 }
 
 minutes="" bag="" rig=$source_dir/config/demo.yaml scale=0.5 duration=10 rate=1.0 warm_up=2
-build_dir=$source_dir/build
+build_dir=$source_dir/build hostile=""
 pass_on=()
 while [ $# -gt 0 ]; do
   case $1 in
@@ -50,6 +52,7 @@ while [ $# -gt 0 ]; do
       shift
       ;;
     --overload) pass_on+=(--overload) ;;
+    --hostile) hostile=yes ;;
     --help | -h) usage; exit 0 ;;
     -*) fail "unknown option '$1'; try --help" ;;
     *) [ -z "$minutes" ] || fail "MINUTES is given twice"; minutes=$1 ;;
@@ -72,7 +75,7 @@ trap 'exit 130' INT TERM
 set +u
 source "$build_dir/devel/setup.bash"
 set -u
-if [ -z "$bag" ]; then
+if [ -z "$bag" ] && [ -z "$hostile" ]; then
   bag=$work/drive.bag
   simulator=$build_dir/devel/lib/semantic_lidar_fusion/simulate_drive
   [ -x "$simulator" ] || fail "simulate_drive is not built; give --bag and --rig"
@@ -84,9 +87,16 @@ port=$(/usr/bin/python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0
 export ROS_MASTER_URI=http://127.0.0.1:$port
 roscore -p "$port" >"$work/roscore.log" 2>&1 &
 roscore_pid=$!
+sim_time=true
+[ -z "$hostile" ] || sim_time=false
 for _ in $(seq 200); do
-  rosparam set /use_sim_time true 2>/dev/null && break
+  rosparam set /use_sim_time $sim_time 2>/dev/null && break
   sleep 0.1
 done
+if [ -n "$hostile" ]; then
+  SLF_BIN_DIR=$build_dir/devel/lib/semantic_lidar_fusion \
+    /usr/bin/python3 "$source_dir/test/hostile.py" --minutes "$minutes"
+  exit
+fi
 /usr/bin/python3 "$source_dir/test/soak.py" "$bag" "$rig" --minutes "$minutes" \
   --warm-up "$warm_up" --rate "$rate" ${pass_on[@]+"${pass_on[@]}"}

@@ -6,6 +6,7 @@ Prints one line for each sample and, at the end, what was measured against its l
 only if all limits hold."""
 import argparse
 import os
+import re
 import statistics
 import sys
 import threading
@@ -19,6 +20,11 @@ import live  # noqa: E402
 CLOUD = "/points_semantic"
 # A scan whose images end with the bag is under way when the bag starts anew.
 AT_THE_LOOP = "dropped: scan pending at a clock jump"
+# Drops of points, of references and of a camera's messages, which are no scans.
+OF_NO_SCAN = re.compile(
+    "dropped: (points |packets |scan_reference|.*/scan_reference|"
+    r".*[ /](images?|image_selected|semantics|scores|labels|probabilities|share|selection)\b)"
+)
 
 
 def make_parser():
@@ -94,8 +100,7 @@ def counters(diagnostics):
     lost = {}
     for values in (motion, projection):
         for key, value in values.items():
-            about_points = "dropped: points" in key and "from before" not in key
-            if key.startswith("dropped:") and "scan_reference from" not in key and not about_points:
+            if key.startswith("dropped:") and not OF_NO_SCAN.match(key):
                 lost[key] = lost.get(key, 0) + int(value)
     used = {k.split(":")[0]: int(v) for k, v in projection.items() if k.endswith(": images used")}
     return given, out, lost, used

@@ -29,7 +29,9 @@ cmake -S "$source_dir" -B "$build_dir" -DCMAKE_CXX_COMPILER=clang++ -DSLF_SANITI
   -DCMAKE_BUILD_TYPE=Release -DCMAKE_CXX_FLAGS_RELEASE=-O1 -DSLF_BUILD_SIMULATOR=OFF \
   -DPYTHON_EXECUTABLE=/usr/bin/python3 -DPython3_EXECUTABLE=/usr/bin/python3 >"$probe/cmake.log" 2>&1 ||
   { cat "$probe/cmake.log"; exit 1; }
-cmake --build "$build_dir" --target fuzzers -- -j"$jobs" >"$probe/build.log" 2>&1 ||
+targets=(fuzzers)
+[ $# -eq 0 ] || targets=("${@/#/fuzz_}")
+cmake --build "$build_dir" --target "${targets[@]}" -- -j"$jobs" >"$probe/build.log" 2>&1 ||
   { tail -50 "$probe/build.log"; exit 1; }
 
 # Leaks of the libraries' own singletons are none of ours, and no single input shows one. Stacks of
