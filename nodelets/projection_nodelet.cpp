@@ -19,6 +19,7 @@
 #include "edge/tf_subscription.h"
 #include "edge/topics.h"
 #include "semantic_lidar_fusion/fusion/calibration_notes.h"
+#include "semantic_lidar_fusion/fusion/lidar_rows.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
@@ -75,6 +76,7 @@ class ProjectionNodelet : public FusionNodelet {
   void initialize() override {
     pipeline_ = std::make_unique<ScanPipeline>(
         rig(), PipelineSteps{PipelineStep::kView, PipelineStep::kFuse});
+    lidar_rows_ = std::make_unique<LidarRows>(rig());
 
     FusionQueueConfig queue;
     for (const CameraConfig& camera : rig().cameras) {
@@ -299,10 +301,11 @@ class ProjectionNodelet : public FusionNodelet {
     std::vector<CameraView> views;
     for (const auto& camera : cameras_) {
       const auto index = static_cast<std::size_t>(camera->index);
-      const std::optional<SegmentedImage> image =
+      const CameraPlace place = placeOf(*camera, cloud.frame_id);
+      std::optional<SegmentedImage> image =
           cloud.empty() ? std::nullopt : imageOf(*camera, scan.views[index]);
-      views.push_back(pipeline_->view(index, place(*camera, cloud.frame_id),
-                                      image ? &*image : nullptr, cloud.stamp,
+      if (image) image->lidar_rows = lidar_rows_->of(index, place);
+      views.push_back(pipeline_->view(index, place, image ? &*image : nullptr, cloud.stamp,
                                       tf_->source().odometry(), T_vehicle_lidar.transform));
     }
     for (const std::string& note : calibration_notes_.news(rig(), views)) NODELET_WARN_STREAM(note);
@@ -316,6 +319,9 @@ class ProjectionNodelet : public FusionNodelet {
       NODELET_WARN_STREAM(result.note);
     }
     countPoints(result.cloud);
+    for (const CameraFusionReport& report : result.cameras) {
+      health().count(report.name + ": points beyond lidar_rows", report.beyond_rows);
+    }
     watchScan(scan, views, T_vehicle_lidar.transform, result.cloud);
     publish(output_, semanticCloudMessage(result.cloud, rig().classes));
     if (drawn) publishOverlays(scan, result);
@@ -332,7 +338,7 @@ class ProjectionNodelet : public FusionNodelet {
   }
 
   /// Model and extrinsics; no model if either is unknown.
-  CameraPlace place(const Camera& camera, const std::string& lidar_frame) {
+  CameraPlace placeOf(const Camera& camera, const std::string& lidar_frame) {
     const std::string& name = camera.config.name;
     CameraPlace place;
     if (!camera.geometry.model()) {
@@ -434,6 +440,7 @@ class ProjectionNodelet : public FusionNodelet {
   }
 
   std::unique_ptr<ScanPipeline> pipeline_;
+  std::unique_ptr<LidarRows> lidar_rows_;
   std::unique_ptr<FusionQueue> queue_;
   std::unique_ptr<TuningServer> tuning_;
   std::unique_ptr<TfSubscription> tf_;

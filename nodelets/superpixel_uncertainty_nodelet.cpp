@@ -14,9 +14,12 @@
 #include <vector>
 
 #include "base/fusion_nodelet.h"
+#include "edge/camera_geometry.h"
 #include "edge/conversions.h"
+#include "edge/tf_subscription.h"
 #include "edge/topics.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/fusion/lidar_rows.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
@@ -47,12 +50,18 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     SegmentedImage segmented;
   };
   struct Camera {
-    Camera(const CameraConfig& config, std::size_t index) : config(config), index(index) {}
+    Camera(const CameraConfig& config, std::size_t index)
+        : config(config), index(index), geometry(config) {}
 
     const CameraConfig& config;
     const std::size_t index;  ///< in the rig file
+    /// For `lidar_rows: auto`; of the callbacks that run one at a time.
+    CameraGeometry geometry;
+    bool has_rows = !config.finds_lidar_rows;
+    ros::Subscriber info_subscriber;
     std::mutex mutex;  ///< guards what follows, up to the publishers, and the pipeline's camera
     std::string told_clamping;
+    RowBand lidar_rows;
     std::unique_ptr<EpochMonitor> epochs;
     Outputs outputs;  ///< complete, to be published
     StampedStore<Image> images{kWaiting};
@@ -88,13 +97,59 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     if (cameras_.empty() && !only.empty()) {
       throw ConfigError({"camera: is '" + only + "', which the rig file does not list"});
     }
+    if (std::any_of(cameras_.begin(), cameras_.end(),
+                    [](const auto& camera) { return camera->config.finds_lidar_rows; })) {
+      findLidarRows();
+    }
     followTuning();
+  }
+
+  /// Follows what the rows of `lidar_rows: auto` come from.
+  void findLidarRows() {
+    lidar_rows_ = std::make_unique<LidarRows>(rig());
+    tf_ = std::make_unique<TfSubscription>(getNodeHandle(), rig());
+    for (const auto& owned : cameras_) {
+      Camera* camera = owned.get();
+      // Read from the start: it may be latched, or come only once.
+      camera->info_subscriber = subscribe<sensor_msgs::CameraInfo>(
+          getNodeHandle(), inputTopic(camera->config, camera->config.camera_info), 8,
+          [this, camera](const sensor_msgs::CameraInfoConstPtr& info) {
+            camera->geometry.update(*info);
+            updateLidarRows(camera);
+          },
+          Health::Expect::kOnce);
+      if (camera->config.withoutCameraInfo()) {
+        health().retireInput(camera->info_subscriber.getTopic());
+      }
+    }
+    startTicking();
+  }
+
+  /// Transforms may come after the last camera_info.
+  void tick(StampNs /*now_ns*/) override {
+    for (const auto& camera : cameras_) {
+      if (!camera->has_rows) updateLidarRows(camera.get());
+    }
+  }
+
+  void updateLidarRows(Camera* camera) {
+    if (!camera->geometry.model()) return;
+    const TransformAnswer T_camera_lidar =
+        tf_->source().extrinsics(camera->geometry.frame(), rig().lidar.frame);
+    if (!T_camera_lidar) return;  // the projection tells it
+    const RowBand rows = lidar_rows_->of(
+        camera->index,
+        {camera->geometry.model(), camera->config.nudge.applied(*T_camera_lidar.transform)});
+    camera->has_rows = true;
+    const std::lock_guard<std::mutex> lock(camera->mutex);
+    camera->lidar_rows = rows;
   }
 
   void rigChanged() override {
     std::vector<std::unique_lock<std::mutex>> locks;
     for (const auto& camera : cameras_) locks.emplace_back(camera->mutex);
     pipeline_->retune(rig());
+    for (const auto& camera : cameras_) camera->has_rows = !camera->config.finds_lidar_rows;
   }
 
   /// Different cameras run in parallel; one camera's images come one at a time.
@@ -135,6 +190,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     take(camera, "image_selected", image, [this, camera, image](StampNs stamp) {
       Image waiting{image, {}};
       waiting.segmented.stamp = stamp;
+      waiting.segmented.lidar_rows = camera->lidar_rows;
       waiting.segmented.image = colorImage(image);
       health().count("dropped: " + camera->config.name + " image without scores",
                      camera->images.put(stamp, std::move(waiting)));
@@ -257,6 +313,9 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
   }
 
   std::unique_ptr<ScanPipeline> pipeline_;
+  /// Only with `lidar_rows: auto`.
+  std::unique_ptr<LidarRows> lidar_rows_;
+  std::unique_ptr<TfSubscription> tf_;
   std::vector<std::unique_ptr<Camera>> cameras_;
 };
 

@@ -246,7 +246,11 @@ CameraConfig readCamera(const YAML::Node& node, std::size_t index,
   if (camera.score_format.scale == 0) section.problem("score_scale", "must not be 0");
   section.number("score_offset", &camera.score_format.offset);
   section.number("max_theta_deg", &camera.max_theta_deg, {0, 180});
-  camera.lidar_rows = readRows(section.child("lidar_rows"));
+  if (section.has("lidar_rows") && section.get("lidar_rows").IsScalar()) {
+    section.choice<bool>("lidar_rows", &camera.finds_lidar_rows, {{"auto", true}});
+  } else {
+    camera.lidar_rows = readRows(section.child("lidar_rows"));
+  }
   camera.lens = readLens(section.child("lens"), base_directory, problems);
   if (camera.lens.calibration && camera.rectified) {
     section.problem("lens", "must be left out where `rectified` is true");
@@ -497,6 +501,12 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
   section.keep("classes", rig.classes.size() > 0 ? classesTree(rig.classes) : YamlTree());
   section.keep("cameras", std::move(cameras));
   rig.lidar = readLidar(section.child("lidar"), &own);
+  for (const CameraConfig& camera : rig.cameras) {
+    if (!camera.finds_lidar_rows || (rig.lidar.model && !rig.lidar.frame.empty())) continue;
+    own.push_back("cameras." + camera.name +
+                  ".lidar_rows = auto: needs the lidar's rings and place; name lidar.model and "
+                  "lidar.frame, or the rows {first, last}");
+  }
   {
     YamlSection tf = section.child("tf");
     readTopic(tf, "topic", &rig.tf_topic);

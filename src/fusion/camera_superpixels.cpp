@@ -7,20 +7,19 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-SlicConfig slicConfig(const SuperpixelConfig& config, const RowBand& rows) {
+SlicConfig slicConfig(const SuperpixelConfig& config) {
   SlicConfig slic;
   slic.count = config.count;
   slic.compactness = config.compactness;
   slic.iterations = config.iterations;
   slic.warm_start = config.warm_start;
-  slic.rows = rows;
   return slic;
 }
 
 }  // namespace
 
-CameraSuperpixels::CameraSuperpixels(const SuperpixelConfig& config, const RowBand& lidar_rows)
-    : config_(config), slic_(slicConfig(config, lidar_rows)) {}
+CameraSuperpixels::CameraSuperpixels(const SuperpixelConfig& config)
+    : config_(config), slic_(slicConfig(config)) {}
 
 std::optional<ImageSize> CameraSuperpixels::mapSize(const ImageSize& image) const {
   if (config_.scale <= 0) return scores_size_;
@@ -29,7 +28,7 @@ std::optional<ImageSize> CameraSuperpixels::mapSize(const ImageSize& image) cons
 }
 
 std::string CameraSuperpixels::clampNote(const ImageSize& map_size) const {
-  const int most = clampedSuperpixelCount(slicConfig(config_, {}), map_size);
+  const int most = clampedSuperpixelCount(slicConfig(config_), map_size);
   if (most >= config_.count) return {};
   return "superpixels.count = " + std::to_string(config_.count) + ": a map of " +
          sizeText(map_size) + " pixels holds no more than " + std::to_string(most) +
@@ -41,7 +40,8 @@ void CameraSuperpixels::noteScores(const cv::Mat& scores) {
 }
 
 SuperpixelMap CameraSuperpixels::cluster(const cv::Mat& image, const ImageSize& map_size,
-                                         StampNs stamp) {
+                                         StampNs stamp, const RowBand& lidar_rows) {
+  slic_.setRows(lidar_rows);
   return slic_.cluster(image, map_size, stamp);
 }
 

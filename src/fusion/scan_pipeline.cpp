@@ -78,8 +78,8 @@ ScanPipeline::ScanPipeline(const Rig& rig, const PipelineSteps& steps) : rig_(ri
   if (has(PipelineStep::kView)) ego_masks_ = loadEgoMasks(rig_.cameras);
   if (has(PipelineStep::kSegment)) {
     segmentation_ = std::make_unique<Segmentation>();
-    for (const CameraConfig& camera : rig_.cameras) {
-      segmentation_->cameras.emplace_back(rig_.superpixels, camera.lidar_rows);
+    for (std::size_t i = 0; i < rig_.cameras.size(); ++i) {
+      segmentation_->cameras.emplace_back(rig_.superpixels);
     }
     if (has(PipelineStep::kNetwork) && !rig_.segmentation.model.empty()) {
       segmentation_->model =
@@ -104,6 +104,12 @@ bool ScanPipeline::has(PipelineStep step) const {
 
 void ScanPipeline::require(PipelineStep step) const {
   if (!has(step)) throw std::logic_error("a step of the pipeline is called that was not built");
+}
+
+/// Those of the rig, or those found.
+RowBand ScanPipeline::lidarRows(std::size_t index, const SegmentedImage& image) const {
+  const CameraConfig& camera = rig_.cameras[index];
+  return camera.finds_lidar_rows ? image.lidar_rows : camera.lidar_rows;
 }
 
 // --- Semantics of an image (eq. 1-4)
@@ -156,7 +162,7 @@ void ScanPipeline::cluster(std::size_t index, SegmentedImage* image) {
   const cv::Mat& ids = image->superpixels.ids;
   if (!size || (!ids.empty() && ImageSize{ids.cols, ids.rows} == *size)) return;
   image->note = camera.clampNote(*size);
-  image->superpixels = camera.cluster(image->image, *size, image->stamp);
+  image->superpixels = camera.cluster(image->image, *size, image->stamp, lidarRows(index, *image));
 }
 
 cv::Mat ScanPipeline::probabilities(const SegmentedImage& image) const {
@@ -203,6 +209,7 @@ CameraView ScanPipeline::view(std::size_t index, const CameraPlace& place,
   if (!image || !place.model) return view;
   view.image_ns = imageTime(index, image->stamp);
   view.semantics = image->semantics;
+  view.lidar_rows = lidarRows(index, *image);
   view.has_image = true;
   const bool rolling = place.model->rollingShutter();
   if (!rig_.motion_enabled || (view.image_ns == reference_ns && !rolling)) return view;

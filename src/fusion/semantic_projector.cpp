@@ -281,6 +281,8 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
   }
 
   const EgoMask mask(view.ego_mask, size);
+  const double first_row = view.lidar_rows.first * size.height;
+  const double end_row = view.lidar_rows.last * size.height;
   CameraVotes& votes = outcome->votes;
   CameraFusionReport& report = outcome->report;
   outcome->pixels.reserve(points.size());
@@ -300,6 +302,7 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
       report.status.push_back(status);
     }
     if (status == PointStatus::kFused) {
+      if (row + 1 <= first_row || row >= end_row) ++report.beyond_rows;
       outcome->pixels.push_back({column, row});
       votes.index.push_back(points.index[k]);
       votes.theta.push_back(points.theta[k]);

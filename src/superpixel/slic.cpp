@@ -117,6 +117,13 @@ SuperpixelMap extended(SuperpixelMap map, const cv::Range& rows, int height) {
   return map;
 }
 
+/// What is wrong with a band; empty if nothing.
+std::string problemOf(const RowBand& rows) {
+  if (rows.first >= 0.0 && rows.first < rows.last && rows.last <= 1.0) return {};
+  return "superpixel rows are " + std::to_string(rows.first) + " to " + std::to_string(rows.last) +
+         ", must ascend within 0..1";
+}
+
 std::uint64_t roundedMean(std::uint64_t sum, std::uint64_t count) {
   return (2 * sum + count) / (2 * count);
 }
@@ -135,8 +142,11 @@ class Slic::Engine {
   /// Superpixels of the rows `rows` of a map of `whole` size.
   SuperpixelMap cluster(const cv::Mat& image, const ImageSize& whole, const cv::Range& rows,
                         const std::optional<StampNs>& stamp) {
-    started_warm_ = followsLast(image, whole, stamp);
-    if (whole != whole_) allocate(whole, rows);
+    if (whole != whole_ || rows != rows_) {
+      allocate(whole, rows);
+      has_last_ = false;
+    }
+    started_warm_ = followsLast(image, stamp);
     loadPlanes(image);
     if (started_warm_) {
       const std::uint64_t last_residual = residual_;
@@ -159,11 +169,8 @@ class Slic::Engine {
   bool startedWarm() const { return started_warm_; }
 
  private:
-  bool followsLast(const cv::Mat& image, const ImageSize& whole,
-                   const std::optional<StampNs>& stamp) const {
-    if (!config_.warm_start || !has_last_ || whole != whole_ || image.channels() != channels_) {
-      return false;
-    }
+  bool followsLast(const cv::Mat& image, const std::optional<StampNs>& stamp) const {
+    if (!config_.warm_start || !has_last_ || image.channels() != channels_) return false;
     if (!stamp || !last_stamp_) return true;
     return *stamp > *last_stamp_ && *stamp - *last_stamp_ <= kMaxWarmGapNs;
   }
@@ -171,7 +178,7 @@ class Slic::Engine {
   void allocate(const ImageSize& whole, const cv::Range& rows) {
     const ImageSize size{whole.width, rows.size()};
     whole_ = whole;
-    first_row_ = rows.start;
+    rows_ = rows;
     size_ = size;
     block_columns_ = (size.width + kBlockWidth - 1) / kBlockWidth;
     block_rows_ = (size.height + kBlockHeight - 1) / kBlockHeight;
@@ -233,7 +240,7 @@ class Slic::Engine {
   }
 
   void loadRow(const cv::Mat& image, int y) {
-    const std::uint8_t* row = reduction_.row(image, first_row_ + y, *kernels_);
+    const std::uint8_t* row = reduction_.row(image, rows_.start + y, *kernels_);
     std::uint8_t* const planes[3] = {rawRow(0, y), rawRow(1, y), rawRow(2, y)};
     if (channels_ == 1) {
       // The opponent colours of grey.
@@ -469,8 +476,8 @@ class Slic::Engine {
 
   // Depend on the size of the map alone.
   ImageSize whole_;
-  int first_row_ = 0;  ///< of the map that is clustered
-  ImageSize size_;     ///< of what is clustered
+  cv::Range rows_;  ///< of the map that are clustered
+  ImageSize size_;  ///< of what is clustered
   int block_columns_ = 0, block_rows_ = 0;
   int stride_ = 0;  ///< of planes and indices: whole blocks
   int row_step_ = 1;
@@ -523,11 +530,8 @@ Slic::Slic(const SlicConfig& config) : config_(config) {
     problems.push_back("superpixels.iterations is " + std::to_string(config.iterations) +
                        ", must be 1..100");
   }
-  if (!(config.rows.first >= 0.0 && config.rows.first < config.rows.last &&
-        config.rows.last <= 1.0)) {
-    problems.push_back("superpixel rows are " + std::to_string(config.rows.first) + " to " +
-                       std::to_string(config.rows.last) + ", must ascend within 0..1");
-  }
+  const std::string rows_problem = problemOf(config.rows);
+  if (!rows_problem.empty()) problems.push_back(rows_problem);
   if (!problems.empty()) throw ConfigError(problems);
   engine_ = std::make_unique<Engine>(config);
 }
@@ -548,6 +552,12 @@ SuperpixelMap Slic::cluster(const cv::Mat& image, const ImageSize& map_size,
   const cv::Range rows = rowsOf(config_.rows, map_size.height);
   SuperpixelMap map = engine_->cluster(image, map_size, rows, stamp);
   return rows.size() < map_size.height ? extended(std::move(map), rows, map_size.height) : map;
+}
+
+void Slic::setRows(const RowBand& rows) {
+  const std::string problem = problemOf(rows);
+  if (!problem.empty()) throw ConfigError({problem});
+  config_.rows = rows;
 }
 
 void Slic::reset() { engine_->reset(); }

@@ -65,7 +65,8 @@ struct CameraConfig {
   std::string mask;          ///< path of an 8-bit image, 0 = never transfer; empty = none
   ScoreFormat score_format;  ///< keys score_scale, score_offset
   double max_theta_deg = 0.0;
-  RowBand lidar_rows;  ///< that the lidar's points can reach
+  RowBand lidar_rows;             ///< that the lidar's points can reach
+  bool finds_lidar_rows = false;  ///< `lidar_rows: auto`: they are found, see LidarRows
   LensFileConfig lens;
   ShutterConfig shutter;
   CameraNudge nudge;

@@ -15,8 +15,8 @@ namespace semantic_lidar_fusion {
 /// Superpixels of one camera's images, in the order in which the images are given. Not thread-safe.
 class CameraSuperpixels {
  public:
-  /// `lidar_rows`: those in which superpixels are wanted. Throws ConfigError.
-  explicit CameraSuperpixels(const SuperpixelConfig& config, const RowBand& lidar_rows = {});
+  /// Throws ConfigError.
+  explicit CameraSuperpixels(const SuperpixelConfig& config);
 
   /// Size of the superpixel map of an image: floor(image * scale), at least 1 x 1; without a scale
   /// the size of the scores, which is empty until scores were seen.
@@ -27,8 +27,10 @@ class CameraSuperpixels {
   void noteScores(const cv::Mat& scores);
 
   /// `image`: CV_8UC1 or CV_8UC3 (BGR), taken at `stamp`; with `superpixels.warm_start` the result
-  /// depends on the image before, if it is recent. Throws DataError.
-  SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size, StampNs stamp);
+  /// depends on the image before, if it is recent. `lidar_rows`: those in which superpixels are
+  /// wanted; with others than for the image before it starts cold. Throws DataError, ConfigError.
+  SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size, StampNs stamp,
+                        const RowBand& lidar_rows);
 
  private:
   SuperpixelConfig config_;

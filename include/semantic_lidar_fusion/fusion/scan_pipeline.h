@@ -26,9 +26,10 @@ namespace semantic_lidar_fusion {
 
 /// What is known of one image: its pixels and semantics, and what was derived from them.
 struct SegmentedImage {
-  StampNs stamp = 0;  ///< raw
-  cv::Mat image;      ///< CV_8UC1 or CV_8UC3 BGR; empty if nothing needs it
-  cv::Mat input;      ///< scores, labels or probabilities, after the camera's `input`
+  StampNs stamp = 0;   ///< raw
+  cv::Mat image;       ///< CV_8UC1 or CV_8UC3 BGR; empty if nothing needs it
+  cv::Mat input;       ///< scores, labels or probabilities, after the camera's `input`
+  RowBand lidar_rows;  ///< that points can reach (see LidarRows); with `lidar_rows: auto`
   std::shared_ptr<const void> owner;  ///< keeps the memory of `image` and `input`
   SuperpixelMap superpixels;          ///< empty until the image is clustered
   cv::Mat share;                      ///< CV_32FC1; scores only
@@ -99,6 +100,7 @@ class ScanPipeline {
   struct Segmentation;
 
   bool has(PipelineStep step) const;
+  RowBand lidarRows(std::size_t index, const SegmentedImage& image) const;
   /// Throws std::logic_error if the step is not built.
   void require(PipelineStep step) const;
 

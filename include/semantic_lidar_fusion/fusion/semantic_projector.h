@@ -44,6 +44,7 @@ struct CameraView {
   /// The camera's at image_ns, for a rolling shutter; empty: it stands still, or is not known.
   std::optional<Twist> motion;
   ImageSemantics semantics;
+  RowBand lidar_rows;  ///< in which superpixels were made; points beyond are counted
   /// Of each point of the cloud whether the camera sees it, where that is known; empty: the
   /// occlusion mask decides.
   std::vector<std::uint8_t> known_visible;
@@ -69,6 +70,8 @@ struct CameraFusionReport {
   std::vector<std::uint8_t> label;   ///< the point's label over all cameras, kNoLabel = none
   std::size_t nonfinite = 0;  ///< visible points given a uniform P: score not finite, share outside
                               ///< (0, 1] or probabilities that are no distribution
+  std::size_t beyond_rows = 0;  ///< visible points beyond `lidar_rows`, whose share is that of a
+                                ///< superpixel at the border
 };
 
 struct FusionResult {

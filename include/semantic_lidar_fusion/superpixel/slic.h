@@ -51,6 +51,10 @@ class Slic {
   SuperpixelMap cluster(const cv::Mat& image, const ImageSize& map_size,
                         std::optional<StampNs> stamp = std::nullopt);
 
+  /// Other `rows` from the next image on, which starts cold if they are other blocks. Throws
+  /// ConfigError.
+  void setRows(const RowBand& rows);
+
   /// Forgets the image before: the next one starts cold.
   void reset();
 

@@ -67,6 +67,7 @@ FusionRun::FusionRun(const FuseBagOptions& options, const std::vector<OutputOpti
               [this](const rosbag::MessageInstance& message) { scans_->take(message); }),
       images_(rig_, reader_.index(), options.all),
       places_(rig_, reader_.index(), poses_, &drops_, &watch_),
+      lidar_rows_(rig_),
       progress_("fusing", reader_.scanCount(), !options.quiet),
       most_under_way_(static_cast<std::size_t>(options.jobs) + 2) {
   const bool takes_truth =
@@ -239,6 +240,7 @@ void FusionRun::plan(const std::shared_ptr<ScanTask>& task) {
     bool is_new = false;
     task->images[c] = images_.find(c, *stamp, place.model->imageSize(), &is_new);
     if (!is_new) continue;
+    task->images[c]->lidar_rows = lidar_rows_.of(c, place);
     task->images[c]->keeps_pixels = task->scan.number % RigWatch::kEdgesEvery == 0;
     task->new_images.push_back(task->images[c]);
   }

@@ -21,6 +21,7 @@
 #include <vector>
 
 #include "edge/tf_pose_source.h"
+#include "semantic_lidar_fusion/fusion/lidar_rows.h"
 #include "tools/common/bag_input.h"
 #include "tools/common/progress_bar.h"
 #include "tools/common/work_lines.h"
@@ -86,6 +87,7 @@ class FusionRun {
   DriveReader reader_;
   ImageSource images_;
   CameraPlaces places_;
+  LidarRows lidar_rows_;
   std::optional<VisibilityTruth> truth_;
   ProgressBar progress_;
   std::size_t written_ = 0;

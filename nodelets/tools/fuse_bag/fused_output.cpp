@@ -48,7 +48,10 @@ OutputTask FusedOutput::plan(const ScanTask& task, TimedCloud raw, TfPoseSource*
   for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
     result.places.push_back(places->at(c, info_times[c], lidar_frame));
     SegmentedImage image;  // its semantics come when it is made
-    if (task.images[c]) image.stamp = task.images[c]->stamp;
+    if (task.images[c]) {
+      image.stamp = task.images[c]->stamp;
+      image.lidar_rows = task.images[c]->lidar_rows;
+    }
     result.views.push_back(pipeline_.view(c, result.places[c], task.images[c] ? &image : nullptr,
                                           scan.reference_ns, odometry, T_vehicle_lidar));
     const CameraView& view = result.views.back();
@@ -173,6 +176,7 @@ void FusedOutput::count(const ScanTask& task, const OutputTask& result) {
   for (const CameraFusionReport& report : result.result.cameras) {
     drops_.add("camera " + report.name + ": points on scores that are not finite (uniform)",
                report.nonfinite);
+    drops_.add("camera " + report.name + ": points beyond lidar_rows", report.beyond_rows);
   }
 }
 

@@ -25,6 +25,7 @@ void checkSize(const SegmentedImage& image, const ImageSize& wanted) {
 std::shared_ptr<SegmentedImage> decoded(const ImageTask& task) {
   auto result = std::make_shared<SegmentedImage>();
   result->stamp = task.stamp;
+  result->lidar_rows = task.lidar_rows;
   if (task.file) result->image = decodedImage(*task.file);
   if (task.pixels) result->image = colorImage(task.pixels);
   if (task.semantics) result->input = pixelView(*task.semantics);

@@ -17,8 +17,9 @@ namespace semantic_lidar_fusion {
 /// An image on its way: asked for, then made in another thread.
 struct ImageTask {
   std::size_t camera = 0;
-  StampNs stamp = 0;  ///< raw
-  ImageSize size;     ///< what camera_info says
+  StampNs stamp = 0;   ///< raw
+  ImageSize size;      ///< what camera_info says
+  RowBand lidar_rows;  ///< see SegmentedImage
   std::string frame_id;
   sensor_msgs::CompressedImageConstPtr file;
   sensor_msgs::ImageConstPtr pixels, semantics;

@@ -240,6 +240,17 @@ TEST(RigTest, ClassesMayBeAPathAFileKeyOrInPlace) {
   EXPECT_EQ(parse("classes: [{name: a, color: [0, 0, 0]}]").classes.size(), 1);
 }
 
+TEST(RigTest, FindsTheRowsOfALidarThatItKnows) {
+  const std::string text =
+      "classes: classes_usyd12.yaml\ncameras: [{name: a, lidar_rows: auto}, {name: b}]\n";
+  const Rig rig = parse(text + "lidar: {model: VLP16, frame: velodyne}");
+  EXPECT_TRUE(rig.cameras[0].finds_lidar_rows);
+  EXPECT_FALSE(rig.cameras[1].finds_lidar_rows);
+  EXPECT_TRUE(parse(rig.yaml).cameras[0].finds_lidar_rows);
+  EXPECT_THROW(parse(text + "lidar: {model: VLP16}"), ConfigError);
+  EXPECT_THROW(parse(text + "lidar: {frame: velodyne}"), ConfigError);
+}
+
 TEST(RigTest, KnowsTheLidarsByTheirMakersNamesToo) {
   const std::pair<const char*, const char*> names[] = {
       {"VLP16", "VLP16"},         {"VLP-16", "VLP16"},     {"Puck LITE", "VLP16"},
@@ -403,6 +414,11 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
             "rig.yaml: cameras.A0.lidar_rows.last = 1.1: must"},
            {"[{name: A0, lidar_rows: {first: 0.5, last: 0.5}}]",
             "rig.yaml: cameras.A0.lidar_rows.last = 0.5: must be above `first`"},
+           {"[{name: A0, lidar_rows: yes}]",
+            "rig.yaml: cameras.A0.lidar_rows = yes: must be one of auto"},
+           {"[{name: A0, lidar_rows: auto}]",
+            "rig.yaml: cameras.A0.lidar_rows = auto: needs the lidar's rings and place; name "
+            "lidar.model and lidar.frame"},
            {"[{name: A0, lens: {file: no.yaml}}]",
             "rig.yaml: cameras.A0.lens.file = no.yaml: must be a readable file; '"},
            {"[{name: A0, lens: {camera: cam0}}]",

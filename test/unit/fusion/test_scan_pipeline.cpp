@@ -249,6 +249,25 @@ TEST(ScanPipelineTest, AnImageMayBeClusteredBeforeItsScoresCome) {
   }
 }
 
+TEST(ScanPipelineTest, RowsAreThoseOfTheRigUnlessItSaysAuto) {
+  const std::string text = "lidar: {model: VLP16, frame: lidar}\nsuperpixels: {count: 30}\n";
+  for (const bool finds : {true, false}) {
+    Rig with_rows = rig(text);
+    with_rows.cameras[0].finds_lidar_rows = finds;
+    with_rows.cameras[0].lidar_rows = {0.5, 1.0};
+    ScanPipeline pipeline(with_rows, {PipelineStep::kSegment, PipelineStep::kView});
+    SegmentedImage found = image(3, kStart);
+    found.lidar_rows = {0.0, 0.3};
+    pipeline.segment(0, &found);
+    // Blocks of 16 of 40 rows.
+    EXPECT_EQ(found.superpixels.rows, finds ? cv::Range(0, 16) : cv::Range(16, 40));
+    const CameraView view = pipeline.view(0, {pinhole(), mounted(-0.4, 1.2)}, &found, kStart,
+                                          drive(), mounted(1.0, 0.1));
+    EXPECT_EQ(view.lidar_rows.first, finds ? 0.0 : 0.5);
+    EXPECT_EQ(view.lidar_rows.last, finds ? 0.3 : 1.0);
+  }
+}
+
 TEST(ScanPipelineTest, ScoresOfAnotherSizeAreClusteredAnew) {
   ScanPipeline pipeline(rig(), {PipelineStep::kSegment});
   SegmentedImage first = image(1, kStart);

@@ -606,6 +606,20 @@ TEST(SemanticProjector, GivesEachStatusItsMeaning) {
   EXPECT_NEAR(report.v[0], 4, 0.02);
 }
 
+TEST(SemanticProjector, CountsTheVisiblePointsBeyondTheRowsOfTheLidar) {
+  Cloud cloud = handCloud();
+  for (const int row : {1, 2, 3, 6, 7}) addPoint(&cloud, pointAt(row, row, 5), 0);
+  CameraView view = handCamera();
+  const int height = view.model->imageSize().height;
+  EXPECT_EQ(SemanticProjector(handConfig()).fuse(cloud, {view}).cameras[0].beyond_rows, 0u);
+  view.lidar_rows = {2.0 / height, 6.0 / height};  // rows 2 to 5
+  const FusionResult result = SemanticProjector(handConfig()).fuse(cloud, {view});
+  EXPECT_EQ(statuses(result), (std::vector<int>{0, 0, 0, 0, 0}));
+  EXPECT_EQ(result.cameras[0].beyond_rows, 3u);
+  view.lidar_rows = {2.5 / height, 6.5 / height};  // parts of rows 2 and 6
+  EXPECT_EQ(SemanticProjector(handConfig()).fuse(cloud, {view}).cameras[0].beyond_rows, 2u);
+}
+
 TEST(SemanticProjector, KnownVisibilityStandsInForTheMask) {
   Cloud cloud = handCloud();
   addPoint(&cloud, pointAt(3, 4, 5));   // said to be hidden

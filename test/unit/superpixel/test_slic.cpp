@@ -281,6 +281,25 @@ TEST(Slic, ABandIsCutAsTheWholeMapAwayFromItsBorder) {
   }
 }
 
+TEST(Slic, AnotherBandStartsAnewAndTheSameGoesOn) {
+  SlicConfig config = withCount(60);
+  config.warm_start = true;
+  const cv::Mat image = patchImage(320, 240, CV_8UC3, 6);
+  Slic slic(config);
+  slic.cluster(image, {160, 120});
+  for (const RowBand& band : {RowBand{0.3, 0.8}, RowBand{0.3, 0.6}, RowBand{}}) {
+    slic.setRows(band);
+    const SuperpixelMap map = slic.cluster(image, {160, 120});
+    EXPECT_FALSE(slic.startedWarm());
+    config.rows = band;
+    EXPECT_EQ(cv::norm(map.ids, Slic(config).cluster(image, {160, 120}).ids, cv::NORM_INF), 0.0);
+    slic.setRows({band.first + 1e-6, band.last});  // in the same blocks
+    slic.cluster(image, {160, 120});
+    EXPECT_TRUE(slic.startedWarm());
+  }
+  EXPECT_THROW(slic.setRows({0.6, 0.5}), ConfigError);
+}
+
 TEST(Slic, BandsOfEveryHeightGiveValidMaps) {
   for (const RowBand& band : {RowBand{0.0, 0.001}, RowBand{0.999, 1.0}, RowBand{0.31, 0.32},
                               RowBand{0.5, 1.0}, RowBand{0.0, 1.0}}) {
