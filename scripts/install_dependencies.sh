@@ -28,7 +28,7 @@ debian_ros="catkin libroscpp-dev libnodelet-dev libnodeletlib-dev libnodeletlib-
   libcv-bridge-dev libtf2-dev libtf2-ros-dev libtf2-eigen-dev libtf2-msgs-dev
   libdiagnostic-updater-dev libdynamic-reconfigure-config-init-mutex-dev libstd-srvs-dev
   python3-dynamic-reconfigure libsensor-msgs-dev libnav-msgs-dev
-  libstd-msgs-dev libgeometry-msgs-dev libdiagnostic-msgs-dev librosbag-dev
+  libstd-msgs-dev libgeometry-msgs-dev libdiagnostic-msgs-dev
   librosbag-storage-dev librostest-dev python3-catkin-pkg python3-roslaunch python3-rosbag
   python3-rospy python3-cv-bridge python3-tf2-ros python3-tf2-msgs python3-sensor-msgs
   python3-nav-msgs python3-std-msgs python3-std-srvs python3-geometry-msgs python3-diagnostic-msgs
@@ -58,7 +58,7 @@ fi
 # ... oracles and peers in tests and benchmarks, the format checks, the fuzzers.
 if [ "$testing" = 1 ]; then
   optional="$optional libopencv-contrib-dev libbenchmark-dev pcl-tools octomap-tools clang
-    mypy python3-venv"
+    mypy python3-venv catkin-lint"
   if [ -d /opt/ros/noetic ]; then
     optional="$optional ros-noetic-pcl-ros"
   else
