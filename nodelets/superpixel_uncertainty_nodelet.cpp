@@ -67,7 +67,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     StampedStore<Image> images{kWaiting};
     StampedStore<sensor_msgs::ImageConstPtr> scores{kWaitingScores};
 
-    ros::Publisher share, superpixels, probabilities, overlay;
+    ros::Publisher share, share_view, superpixels, probabilities, overlay;
     ros::Subscriber image_subscriber, scores_subscriber;
   };
 
@@ -88,7 +88,10 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
       const auto output = [&](const std::string& name) {
         return advertise<sensor_msgs::Image>(getNodeHandle(), cameraTopic(config, name), 4);
       };
-      if (config.input == CameraInput::kScores) camera.share = output("share");
+      if (config.input == CameraInput::kScores) {
+        camera.share = output("share");
+        camera.share_view = output("share_view");
+      }
       camera.superpixels = output("superpixels");
       if (config.input != CameraInput::kProbabilities)
         camera.probabilities = output("probabilities");
@@ -156,8 +159,8 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
   void updateSubscriptions() override {
     for (const auto& owned : cameras_) {
       Camera* camera = owned.get();
-      const bool wants_semantics =
-          isWanted(camera->share) || isWanted(camera->probabilities) || isWanted(camera->overlay);
+      const bool wants_semantics = isWanted(camera->share) || isWanted(camera->share_view) ||
+                                   isWanted(camera->probabilities) || isWanted(camera->overlay);
       const bool wants_image = wants_semantics || isWanted(camera->superpixels);
       update(wants_image, cameraTopic(camera->config, "image_selected"), camera,
              &SuperpixelUncertaintyNodelet::onImage, &camera->image_subscriber);
@@ -271,6 +274,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     if (transfersProbabilities(rig(), camera->config) || listened(camera->probabilities)) {
       add(camera->probabilities, pipeline_->probabilities(segmented));
     }
+    if (listened(camera->share_view)) add(camera->share_view, drawShare(segmented.share));
     if (listened(camera->overlay)) {
       add(camera->overlay,
           drawUncertainty(segmented.image, segmented.superpixels.ids, segmented.share));

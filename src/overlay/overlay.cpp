@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdint>
 #include <cstdio>
 #include <opencv2/imgproc.hpp>
 #include <string>
@@ -267,15 +268,17 @@ std::vector<LegendRow> projectionLegend(const CameraFusionReport& report,
 
 // ---- Uncertainty ---------------------------------------------------------------------------
 
-/// Blue (0, sure) over cyan and yellow to red (1, torn).
+/// Viridis, as in the figures and in reports: light yellow (0, sure) over green to violet (1,
+/// torn).
 cv::Vec3b tintOf(double doubt) {
-  static const std::array<cv::Vec3d, 4> kStops{
-      {{220, 80, 40}, {220, 200, 60}, {60, 220, 250}, {40, 30, 220}}};
-  const double position = std::min(1.0, std::max(0.0, doubt)) * (kStops.size() - 1);
-  const std::size_t stop = std::min(kStops.size() - 2, static_cast<std::size_t>(position));
-  const cv::Vec3d color =
-      kStops[stop] + (kStops[stop + 1] - kStops[stop]) * (position - static_cast<double>(stop));
-  return cv::Vec3b(color);
+  static const cv::Mat kColors = [] {
+    cv::Mat values(1, 256, CV_8UC1), colors;
+    for (int i = 0; i < 256; ++i) values.at<std::uint8_t>(i) = static_cast<std::uint8_t>(i);
+    cv::applyColorMap(values, colors, cv::COLORMAP_VIRIDIS);
+    return colors;
+  }();
+  const double sure = 1.0 - std::min(1.0, std::max(0.0, doubt));
+  return kColors.at<cv::Vec3b>(static_cast<int>(std::lround(255.0 * sure)));
 }
 
 double doubtOf(double share) { return (1.0 - share) / (1.0 - kTornShare); }
@@ -409,6 +412,18 @@ cv::Mat drawUncertainty(const cv::Mat& image, const cv::Mat& superpixel_ids, con
     }
   }
   return stack(canvas, scaleBar(panelWidth(canvas)));
+}
+
+cv::Mat drawShare(const cv::Mat& share) {
+  checkMap(share, CV_32FC1, "share");
+  cv::Mat view = cv::Mat::zeros(share.size(), CV_8UC1);
+  for (int y = 0; y < share.rows; ++y) {
+    for (int x = 0; x < share.cols; ++x) {
+      const float s = share.at<float>(y, x);
+      if (s > 0 && s <= 1) view.at<std::uint8_t>(y, x) = cv::saturate_cast<std::uint8_t>(255 * s);
+    }
+  }
+  return view;
 }
 
 }  // namespace semantic_lidar_fusion

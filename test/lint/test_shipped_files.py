@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Launch files, YAML files, plugin descriptions and test files hold together."""
+"""Launch files, YAML and JSON files, plugin descriptions and test files hold together."""
 
 import glob
+import json
 import os
 import re
 import shutil
@@ -118,6 +119,28 @@ def test_rviz_shows_topics_that_the_chain_publishes():
         assert "road" in [c["name"] for c in classes["classes"]]
 
 
+def test_foxglove_shows_what_rviz_shows():
+    """Its layout needs no frame of odometry: it follows the clouds' own."""
+    layout = json.loads(text_of(os.path.join(SOURCE_DIR, "launch", "foxglove.json")))
+
+    def panels(place):
+        if isinstance(place, str):
+            return [place]
+        return panels(place["first"]) + panels(place["second"])
+
+    shown = layout["configById"]
+    assert sorted(panels(layout["layout"])) == sorted(shown)
+    topics = {topic for panel in shown.values() for topic in panel.get("topics", {})}
+    topics |= {p["imageMode"]["imageTopic"] for p in shown.values() if "imageMode" in p}
+    launch = ET.parse(os.path.join(SOURCE_DIR, "launch", "rviz.launch"))
+    camera = launch.find("arg[@name='camera']").get("default")
+    remaps = {r.get("to").replace("$(arg camera)", camera) for r in launch.iter("remap")}
+    assert topics == {"/" + name for name in remaps - {"semantic_grid", "semantic_map"}}
+    fields = {t["colorField"] for p in shown.values() for t in p.get("topics", {}).values()}
+    assert fields == {"rgb", "p_road"}
+    assert not any("followTf" in panel for panel in shown.values())
+
+
 @pytest.mark.skipif(not shutil.which("roslaunch"), reason="roslaunch is not installed")
 def test_fusion_launch_starts_the_network_only_if_asked():
     path = os.path.join(SOURCE_DIR, "launch", "fusion.launch")
@@ -176,9 +199,26 @@ def test_unit_tests_lie_where_the_build_finds_them():
     assert not stray, "not in test/unit/<room>/: %s" % stray
 
 
+def test_classes_have_colours_of_their_own():
+    """Also none that of points without a class (kNoClassRgb, and html_report's)."""
+    header = text_of(os.path.join(SOURCE_DIR, "include/semantic_lidar_fusion/common/cloud_bytes.h"))
+    grey = int(re.search(r"kNoClassRgb = (0x\w+)", header).group(1), 16)
+    none = [grey >> 16, grey >> 8 & 255, grey & 255]
+    report = "scripts/semantic_lidar_fusion/evaluation/html_report.py"
+    page = text_of(os.path.join(SOURCE_DIR, report))
+    assert "_NO_CLASS = (%d, %d, %d)" % tuple(none) in page
+    for path in files("config/classes_*.yaml"):
+        colors = [c["color"] for c in yaml.safe_load(text_of(path))["classes"]] + [none]
+        for i, color in enumerate(colors):
+            for other in colors[:i]:
+                assert max(abs(a - b) for a, b in zip(color, other)) >= 10, (path, color, other)
+
+
 def test_shell_scripts_parse_and_installed_scripts_name_the_system_python():
     for path in (
-        files("scripts/*.sh") + files("test/shell/*.sh") + [os.path.join(SOURCE_DIR, ".ci", "run")]
+        files("scripts/*.sh")
+        + files("test/shell/*.sh")
+        + [os.path.join(SOURCE_DIR, name) for name in (".ci/run", "debian/tests/fuse-a-bag")]
     ):
         subprocess.run(["/bin/bash", "-n", path], check=True)
     for path in files("scripts/*.py"):

@@ -11,7 +11,8 @@ cv2 = pytest.importorskip("cv2")
 pytest.importorskip("semantic_lidar_fusion._core", reason="built with pybind11 only")
 from bag_factory import CLASS_NAMES, Drive  # noqa: E402
 from semantic_lidar_fusion.rig import Rig  # noqa: E402
-from semantic_lidar_fusion.figures import paper_figures  # noqa: E402
+from semantic_lidar_fusion.figures import paper_figures, plotting  # noqa: E402
+from semantic_lidar_fusion.evaluation.metrics import Reliability  # noqa: E402
 from semantic_lidar_fusion.cameras import Camera  # noqa: E402
 from semantic_lidar_fusion.bags.cloud_io import FUSED, OCCLUDED  # noqa: E402
 from semantic_lidar_fusion.errors import ConfigError, DataError  # noqa: E402
@@ -225,3 +226,18 @@ def test_without_the_source_only_what_the_clouds_show(fused, run_command, tmp_pa
     assert code == 1 and "has 3 scans" in err
     code, _, err = run_command("make_figures.py", fused[0], "--camera", "none", *options)
     assert code == 1 and "--camera none" in err
+
+
+def test_the_reliability_diagram_is_whole(tmp_path):
+    """Nothing of it, the legend above included, is cut off at the border."""
+    random = np.random.RandomState(1)
+    reliability = Reliability()
+    values = random.dirichlet([0.3] * 4, 500)
+    reliability.add(values, random.randint(0, 4, 500), values.argmax(axis=1), values.max(axis=1))
+    plotting.draw_reliability(str(tmp_path / "plot.png"), [("a", reliability)] * 2)
+    picture = cv2.imread(str(tmp_path / "plot.png"))
+    for border in (picture[:2], picture[-2:], picture[:, :2], picture[:, -2:]):
+        assert (border == 255).all()
+    legend = picture[: picture.shape[0] // 12].reshape(-1, 3)
+    for color in ([178, 114, 0], [181, 205, 245]):  # of right, and of the gap, as OpenCV reads them
+        assert (np.abs(legend.astype(int) - color).max(axis=1) < 25).sum() > 100, color

@@ -25,12 +25,16 @@ cv::Mat drawProjection(const cv::Mat& image, const CameraFusionReport& report,
                        const SemanticCloud& cloud, const LabelSet& classes,
                        double time_difference_s);
 
-/// Superpixel borders over the image, tinted by 1 - share (blue = sure, red = torn; the scale ends
-/// at a share of 0.25), with a scale bar beneath. Superpixels whose share is not in (0, 1] keep the
-/// image's colours.
+/// Superpixel borders over the image, tinted by 1 - share (light yellow = sure, violet = torn; the
+/// scale ends at a share of 0.25), with a scale bar beneath. Superpixels whose share is not in (0,
+/// 1] keep the image's colours.
 ///
 /// `superpixel_ids` (CV_32SC1) and `share` (CV_32FC1) have one size, not necessarily the image's;
 /// either may be empty. `image` and result as above. Throws DataError.
 cv::Mat drawUncertainty(const cv::Mat& image, const cv::Mat& superpixel_ids, const cv::Mat& share);
+
+/// `share` (CV_32FC1) as CV_8UC1, 255 = sure, for viewers that do not show floats; 0 where it is
+/// not in (0, 1].
+cv::Mat drawShare(const cv::Mat& share);
 
 }  // namespace semantic_lidar_fusion

@@ -25,7 +25,7 @@ STATUS_NAMES = ("fused", "occluded", "outside", "no image", "no odometry")
 STATUS_COLORS = ("#2b7a4b", "#c98a1b", "#9aa3ad", "#7b5ea7", "#c0392b")
 MOST_POINTS = 40000
 MAP_CELL_M = 0.25
-_NO_CLASS = (150, 150, 150)
+_NO_CLASS = (96, 96, 96)  # as in the clouds
 
 
 class ScanLine(NamedTuple):

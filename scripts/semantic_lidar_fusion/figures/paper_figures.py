@@ -21,6 +21,10 @@ from semantic_lidar_fusion.bags.poses import TransformTree, invert, transform_po
 from semantic_lidar_fusion.rig import CameraConfig, Rig
 
 _TOP_VIEW_M = 40.0
+# Behind points whose colour says how sure a class is: what is not of the class hardly stands out.
+_DARK = "#2a0a36"
+_PANORAMA_IN = 3.2  # at most
+_LEGEND_COLUMNS = 6
 T = TypeVar("T")
 
 
@@ -331,7 +335,7 @@ def draw_uncertainty(path: str, view: View, labels: LabelSet) -> None:
         _bare(axis)
     last = axes.flat[3]
     low = min(0.9, float(np.floor(float(share.min()) * 10) / 10))
-    drawn = last.imshow(share, cmap="jet", vmin=low, vmax=1.0)
+    drawn = last.imshow(share, cmap=plotting.SURENESS, vmin=low, vmax=1.0)
     last.set_xlabel(names[3])
     _bare(last)
     figure.subplots_adjust(left=0.01, right=0.93, wspace=0.03, hspace=0.16, bottom=0.14, top=0.99)
@@ -339,14 +343,8 @@ def draw_uncertainty(path: str, view: View, labels: LabelSet) -> None:
     scale = figure.add_axes([box.x1 + 0.01, box.y0, 0.012, box.height])
     figure.colorbar(drawn, cax=scale)
     present = np.unique(label)
-    handles = [
-        plt.Rectangle(
-            (0, 0), 1, 1, facecolor=labels.colors_rgb[i] / 255.0, edgecolor="black", lw=0.4
-        )
-        for i in present
-    ]
     figure.legend(
-        handles,
+        plotting.class_handles(labels.colors_rgb[present]),
         [title_of(labels[i].name) for i in present],
         loc="upper center",
         bbox_to_anchor=(0.47, 0.085),
@@ -388,7 +386,7 @@ def draw_score_maps(path: str, view: View, labels: LabelSet) -> None:
             axis = figure.add_subplot(grid[index // columns, index % columns])
             drawn = axis.imshow(
                 values[..., index],
-                cmap="jet",
+                cmap=plotting.SURENESS,
                 vmin=limits[0],
                 vmax=limits[1],
                 aspect="auto",
@@ -468,9 +466,8 @@ def draw_projection(path: str, scene: Scene) -> None:
                     got.pixel[got.removed, 0],
                     got.pixel[got.removed, 1],
                     c="magenta",
-                    marker="x",
-                    s=max(2.0, 2.0 * size),
-                    linewidths=0.35,
+                    s=size,  # no larger than a point: what it hides stays to be seen
+                    linewidths=0,
                 )
                 text = "%s, masked: %d of %d removed" % (
                     view.name,
@@ -497,9 +494,8 @@ def draw_projection(path: str, scene: Scene) -> None:
         [0.5],
         transform=scale.transAxes,
         c="magenta",
-        marker="x",
-        s=14,
-        lw=0.8,
+        s=8,
+        linewidths=0,
         clip_on=False,
     )
     scale.text(1.46, 0.5, "removed", transform=scale.transAxes, va="center", fontsize=8)
@@ -570,13 +566,81 @@ def _panorama(
     return image, seen[top:bottom, left:right], extent
 
 
-def rainbow() -> Any:
-    """Red = 0 over yellow, green and blue to violet = 1, as RViz colours a channel."""
-    from matplotlib.colors import LinearSegmentedColormap, hsv_to_rgb
+class _Ground(NamedTuple):
+    """The part of the ground that is drawn. x, y: limits in m; across: x of the lidar to the right,
+    not up; ratio: height over width of the picture."""
 
-    hue = np.linspace(0.0, 0.8, 256)
-    colors = hsv_to_rgb(np.stack([hue, np.ones(256), np.full(256, 0.92)], axis=1))
-    return LinearSegmentedColormap.from_list("rainbow_by_hue", colors, N=256)
+    x: Tuple[float, float]
+    y: Tuple[float, float]
+    across: bool
+    ratio: float
+
+
+def _ground(xy: np.ndarray) -> _Ground:
+    """What holds nearly all points (N, 2), without the empty side of a rig that looks one way only."""
+    reach = np.percentile(np.abs(xy).max(axis=1), 92) if len(xy) else 20.0
+    reach = float(np.clip(np.ceil(reach / 5) * 5, 10.0, _TOP_VIEW_M))
+    bounds = []
+    for values in xy.T:
+        low, high = np.percentile(values, (4, 96)) if len(values) else (-reach, reach)
+        bounds.append((max(-reach, min(low, -3.0) - 2.0), min(reach, max(high, 3.0) + 2.0)))
+    (low_x, high_x), (low_y, high_y) = bounds
+    # Wider than high fills the page: lay the longer side across it.
+    across = (high_x - low_x) > (high_y - low_y)
+    ratio = (high_y - low_y) / (high_x - low_x)
+    return _Ground(bounds[0], bounds[1], across, ratio if across else 1.0 / ratio)
+
+
+def _draw_panorama(figure: Any, scene: Scene, height_in: float, panorama_of_scene: Any) -> None:
+    """The panorama at the top of a figure, and the classes of its colours below it."""
+    picture, seen, extent = panorama_of_scene
+    width, total = figure.get_size_inches()
+    axis = figure.add_axes([0.0, 1 - height_in / total, 1.0, height_in / total])
+    aspect = "equal" if height_in == _PANORAMA_IN else "auto"
+    axis.imshow(np.where(seen[..., None], picture, 255), extent=extent, aspect=aspect)
+    axis.set_xlabel("segmented images, %.0f° of azimuth" % (extent[0] - extent[1]), labelpad=3)
+    _bare(axis)
+    for side in axis.spines.values():
+        side.set_visible(False)
+    maps = [_given(view.labels()) for view in scene.views if view.has_directions]
+    present = np.unique(np.concatenate([np.unique(labels) for labels in maps]))
+    figure.legend(
+        plotting.class_handles(scene.labels.colors_rgb[present]),
+        [title_of(scene.labels[i].name) for i in present],
+        loc="upper center",
+        bbox_to_anchor=(0.5, 1 - (height_in + 0.22) / total),
+        ncol=_LEGEND_COLUMNS,
+        handlelength=1,
+        handleheight=0.9,
+        columnspacing=1.1,
+    )
+
+
+def _draw_top_view(axis: Any, xy: np.ndarray, value: np.ndarray, ground: _Ground) -> None:
+    """Points (N, 2) by the probability of one class, the likeliest on top."""
+    order = np.argsort(value)
+    x, y = xy.T
+    first, second = (x, y) if ground.across else (-y, x)
+    axis.set_facecolor(_DARK)
+    axis.scatter(
+        first[order],
+        second[order],
+        c=value[order],
+        cmap=plotting.SURENESS,
+        vmin=0,
+        vmax=1,
+        s=float(np.clip(6000.0 / max(1, len(value)), 0.25, 3.0)),
+        linewidths=0,
+    )
+    axis.plot([0], [0], marker=">" if ground.across else "^", color="white", markersize=4)
+    if ground.across:
+        axis.set(xlim=ground.x, ylim=ground.y)
+    else:
+        axis.set(xlim=(-ground.y[1], -ground.y[0]), ylim=ground.x)
+    axis.set_aspect("equal")
+    _bare(axis)
+    for side in axis.spines.values():
+        side.set_edgecolor("#bbbbbb")
 
 
 def draw_top_views(path: str, scene: Scene) -> None:
@@ -584,78 +648,33 @@ def draw_top_views(path: str, scene: Scene) -> None:
     plt = plotting.pyplot()
     rows_of = scene.labels.evaluation_classes()
     got = panorama(scene)
-    count = len(rows_of)
-    columns = 3 if count in (3, 5, 6, 9) else min(count, 4)
-    rows = -(-count // columns)
-    cloud = scene.cloud
-    fused = cloud.fused
-    xyz = cloud.xyz
-    merged = cloud.probabilities[fused].astype(np.float64) @ scene.labels.merge_matrix()
-    reach = np.percentile(np.abs(xyz[fused, :2]).max(axis=1), 92) if fused.any() else 20.0
-    reach = float(np.clip(np.ceil(reach / 5) * 5, 10.0, _TOP_VIEW_M))
-    # Leave away the empty side of a rig that looks one way only.
-    x, y = xyz[fused, 0], xyz[fused, 1]
-    bounds = []
-    for values in (x, y):
-        low, high = np.percentile(values, (4, 96)) if len(values) else (-reach, reach)
-        bounds.append((max(-reach, min(low, -3.0) - 2.0), min(reach, max(high, 3.0) + 2.0)))
-    (low_x, high_x), (low_y, high_y) = bounds
-    # Wider than high fills the page: lay the longer side across it.
-    across = (high_x - low_x) > (high_y - low_y)
-    ratio = (high_y - low_y) / (high_x - low_x)
-    ratio = ratio if across else 1.0 / ratio
+    columns = 3 if len(rows_of) in (3, 5, 6, 9) else min(len(rows_of), 4)
+    rows = -(-len(rows_of) // columns)
+    fused = scene.cloud.fused
+    xy = scene.cloud.xyz[fused, :2]
+    merged = scene.cloud.probabilities[fused].astype(np.float64) @ scene.labels.merge_matrix()
+    ground = _ground(xy)
     width = 7.2
     cell = width / columns
-    view_height = (cell * ratio + 0.24) * rows
-    pano_height = 0.0
+    view_height = (cell * ground.ratio + 0.24) * rows
+    top, pano_height = 0.0, 0.0
     if got is not None:
-        picture, seen, extent = got
-        pano_height = min(3.2, width * picture.shape[0] / picture.shape[1])
-    total = pano_height + (0.3 if pano_height else 0.0) + view_height + 0.45
+        pano_height = min(_PANORAMA_IN, width * got[0].shape[0] / got[0].shape[1])
+        top = pano_height + 0.3 + 0.2 * -(-len(scene.labels) // _LEGEND_COLUMNS) + 0.1
+    total = top + view_height + 0.45
     figure = plt.figure(figsize=(width, total))
     if got is not None:
-        axis = figure.add_axes([0.0, 1 - pano_height / total, 1.0, pano_height / total])
-        shown = np.where(seen[..., None], picture, 255)
-        axis.imshow(shown, extent=extent, aspect="equal" if pano_height == 3.2 else "auto")
-        axis.set_xlabel("segmented images, %.0f° of azimuth" % (extent[0] - extent[1]), labelpad=3)
-        _bare(axis)
-        for side in axis.spines.values():
-            side.set_visible(False)
-    cmap = rainbow()
+        _draw_panorama(figure, scene, pano_height, got)
     base = view_height + 0.45
     for index, row in enumerate(rows_of):
-        left = (index % columns) / columns
         upper = base - (index // columns) * view_height / rows
-        axis = figure.add_axes(
-            [left + 0.005, (upper - cell * ratio) / total, 1 / columns - 0.01, cell * ratio / total]
-        )
-        axis.set_facecolor("#f7f7f7")
-        value = merged[:, index]
-        order = np.argsort(value)
-        first, second = (x, y) if across else (-y, x)
-        axis.scatter(
-            first[order],
-            second[order],
-            c=value[order],
-            cmap=cmap,
-            vmin=0,
-            vmax=1,
-            s=float(np.clip(6000.0 / max(1, len(value)), 0.25, 3.0)),
-            linewidths=0,
-        )
-        axis.plot([0], [0], marker="^" if not across else ">", color="black", markersize=4)
-        if across:
-            axis.set(xlim=(low_x, high_x), ylim=(low_y, high_y))
-        else:
-            axis.set(xlim=(-high_y, -low_y), ylim=(low_x, high_x))
-        axis.set_aspect("equal")
+        left, low = (index % columns) / columns, (upper - cell * ground.ratio) / total
+        axis = figure.add_axes([left + 0.005, low, 1 / columns - 0.01, cell * ground.ratio / total])
+        _draw_top_view(axis, xy, merged[:, index], ground)
         axis.set_xlabel(title_of(row.name), labelpad=2)
-        _bare(axis)
-        for side in axis.spines.values():
-            side.set_edgecolor("#bbbbbb")
         if index == 0:
             _scale_bar(axis)
-    scalar = plt.cm.ScalarMappable(cmap=cmap)
+    scalar = plt.cm.ScalarMappable(cmap=plotting.SURENESS)
     scalar.set_clim(0, 1)
     scale = figure.add_axes([0.25, 0.2 / total, 0.5, 0.09 / total])
     bar = figure.colorbar(scalar, cax=scale, orientation="horizontal")
@@ -667,8 +686,7 @@ def _scale_bar(axis: Any) -> None:
     """10 m in the upper left corner, readable over points too."""
     (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
     x, y = left + 0.05 * (right - left), bottom + 0.84 * (top - bottom)
-    paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1}
-    axis.plot([x, x + 10], [y, y], color="black", linewidth=1.2, zorder=4)
+    axis.plot([x, x + 10], [y, y], color="white", linewidth=1.2, zorder=4)
     axis.text(
         x + 5,
         y + 0.04 * (top - bottom),
@@ -676,7 +694,8 @@ def _scale_bar(axis: Any) -> None:
         ha="center",
         va="bottom",
         fontsize=7,
-        bbox=paper,
+        color="white",
+        bbox={"facecolor": _DARK, "edgecolor": "none", "alpha": 0.85, "pad": 1},
         zorder=5,
     )
 

@@ -11,6 +11,8 @@ from semantic_lidar_fusion.bags.bag_io import AtomicFile
 from semantic_lidar_fusion.errors import DataError, cannot_write
 from semantic_lidar_fusion.evaluation.metrics import Confusion, Reliability, ratio
 
+# How sure something is, in every figure, overlay and report: dark violet = not at all, light yellow.
+SURENESS = "viridis"
 # Distinct for colour-blind eyes as well.
 COLORS = ("#999999", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
 
@@ -58,6 +60,15 @@ def save(figure: Any, path: str) -> None:
 def title_of(name: str) -> str:
     """A class or file name as a heading: undrivable_road -> Undrivable road."""
     return name.replace("_", " ").capitalize()
+
+
+def class_handles(colors_rgb: np.ndarray) -> List[Any]:
+    """Swatches of a legend: a square of each colour (N, 3), 0 to 255."""
+    plt = pyplot()
+    return [
+        plt.Rectangle((0, 0), 1, 1, facecolor=color / 255.0, edgecolor="black", lw=0.4)
+        for color in colors_rgb
+    ]
 
 
 def draw_reliability(path: str, curves: Sequence[Tuple[str, Reliability]]) -> None:
@@ -124,8 +135,13 @@ def draw_reliability(path: str, curves: Sequence[Tuple[str, Reliability]]) -> No
         plt.Rectangle((0, 0), 1, 1, color=COLORS[1]),
         plt.Rectangle((0, 0), 1, 1, color=COLORS[2], alpha=0.35),
     ]
+    # Above the titles; save() makes room for it.
     figure.legend(
-        handles, ["right", "gap to the confidence"], loc="upper center", ncol=2, borderaxespad=-0.4
+        handles,
+        ["right", "gap to the confidence"],
+        loc="lower center",
+        bbox_to_anchor=(0.5, 0.93),
+        ncol=2,
     )
     save(figure, path)
 

@@ -231,9 +231,9 @@ TEST(DrawUncertainty, TintsByShareAndDrawsBorders) {
   ASSERT_EQ(picture.type(), CV_8UC3);
   const cv::Vec3b sure = at(picture, 30, 30), doubtful = at(picture, 120, 30),
                   torn = at(picture, 30, 90), none = at(picture, 120, 90);
-  EXPECT_GT(sure[0], sure[2] + 20) << "sure is blue";
-  EXPECT_GT(torn[2], torn[0] + 60) << "torn is red";
-  EXPECT_GT(doubtful[1], doubtful[0]) << "between them is green to yellow";
+  EXPECT_GT(sure[2], sure[0] + 20) << "sure is yellow";
+  EXPECT_GT(torn[0], torn[1] + 30) << "torn is violet";
+  EXPECT_GT(doubtful[1], doubtful[2]) << "between them is green";
   EXPECT_EQ(none, cv::Vec3b(100, 100, 100));
   // A line of one pixel where superpixels meet: left of column 80, above row 60.
   for (const auto& p : {cv::Point(79, 30), {79, 90}, {30, 59}, {120, 59}}) {
@@ -246,23 +246,23 @@ TEST(DrawUncertainty, TintsByShareAndDrawsBorders) {
   EXPECT_EQ(at(picture, 159, 119), none);
 }
 
-TEST(DrawUncertainty, HasAScaleBarFromBlueToRed) {
+TEST(DrawUncertainty, HasAScaleBarFromYellowToViolet) {
   cv::Mat ids, share;
   quarters(&ids, &share);
   const cv::Mat image(120, 640, CV_8UC1, cv::Scalar(0));
   const cv::Mat picture = drawUncertainty(image, ids, share);
   EXPECT_EQ(picture.cols, 640);
   ASSERT_GT(picture.rows, 120);
-  int blue = 641, red = -1;
+  int yellow = 641, violet = -1;
   for (int y = 120; y < picture.rows; ++y) {
     for (int x = 0; x < 640; ++x) {
       const cv::Vec3b color = at(picture, x, y);
-      if (color[0] > 180 && color[2] < 80) blue = std::min(blue, x);
-      if (color[2] > 180 && color[0] < 80 && color[1] < 80) red = std::max(red, x);
+      if (color[2] > 230 && color[0] < 60) yellow = std::min(yellow, x);
+      if (color[1] < 20 && color[0] > 70 && color[0] < 110) violet = std::max(violet, x);
     }
   }
-  EXPECT_LT(blue, 64);
-  EXPECT_GT(red, 576);
+  EXPECT_LT(yellow, 64);
+  EXPECT_GT(violet, 576);
 }
 
 TEST(DrawUncertainty, TakesEitherInputAlone) {
@@ -276,6 +276,16 @@ TEST(DrawUncertainty, TakesEitherInputAlone) {
   EXPECT_EQ(at(tint, 79, 30), at(tint, 30, 30));
   EXPECT_NE(at(tint, 30, 30), cv::Vec3b(100, 100, 100));
   EXPECT_EQ(changedPixels(drawUncertainty(image, cv::Mat(), cv::Mat()), image), 0);
+}
+
+TEST(DrawShare, IsOfEightBits) {
+  const float nan = std::numeric_limits<float>::quiet_NaN();
+  const cv::Mat share = (cv::Mat_<float>(2, 3) << 1.0F, 0.5F, 0.1F, 0.0F, nan, 1.5F);
+  const cv::Mat expected = (cv::Mat_<std::uint8_t>(2, 3) << 255, 128, 26, 0, 0, 0);
+  const cv::Mat view = drawShare(share);
+  ASSERT_EQ(view.type(), CV_8UC1);
+  EXPECT_EQ(cv::countNonZero(view != expected), 0) << view;
+  EXPECT_THROW(drawShare(expected), DataError);
 }
 
 TEST(DrawUncertainty, RefusesWhatDoesNotFit) {
