@@ -5,7 +5,7 @@
 #   docker build -t semantic_lidar_fusion .
 #   docker run --rm -v "$PWD:/data" semantic_lidar_fusion \
 #     rosrun semantic_lidar_fusion fuse_bag /data/drive.bag /data/fused.bag --rig /data/rig.yaml
-#   docker run --rm --network host semantic_lidar_fusion \
+#   docker run --rm --network host -v "$PWD:/data" semantic_lidar_fusion \
 #     roslaunch semantic_lidar_fusion fusion.launch rig:=/data/rig.yaml
 ARG BASE=debian:trixie-slim
 FROM $BASE
