@@ -255,7 +255,8 @@ void checkLayers(const cv::dnn::Net& net, const ImageSize& input) {
 
 // ---- The process of its own.
 
-/// <folder of this library>/semantic_lidar_fusion/check_network, in devel and install space.
+/// semantic_lidar_fusion/check_network in the folder of this library, in devel and install space;
+/// or beside that folder: Debian keeps libraries, not programs, in a folder of their architecture.
 std::string checkerPath() {
   Dl_info info{};
   if (dladdr(reinterpret_cast<void*>(&checkOnnxTensors), &info) == 0 || info.dli_fname == nullptr) {
@@ -263,8 +264,12 @@ std::string checkerPath() {
   }
   const std::string library = info.dli_fname;
   const std::size_t slash = library.rfind('/');
-  return (slash == std::string::npos ? "." : library.substr(0, slash)) +
-         "/semantic_lidar_fusion/check_network";
+  const std::string folder = slash == std::string::npos ? "." : library.substr(0, slash);
+  const std::string name = "/semantic_lidar_fusion/check_network";
+  const std::string beside = folder + "/.." + name;
+  return access(beside.c_str(), X_OK) == 0 && access((folder + name).c_str(), X_OK) != 0
+             ? beside
+             : folder + name;
 }
 
 /// What the program writes to its standard output, at most `kMaxAnswer` bytes, and how it ended.
