@@ -267,7 +267,12 @@ cv::Mat decodedImage(const sensor_msgs::CompressedImage& message) {
                     std::to_string(message.data.size()) + " bytes: the JPEG ends too early");
   }
   const std::optional<ImageSize> size = encodedSize(message.data);
-  if (size && std::int64_t{size->width} * size->height > kMostPixels) {
+  if (!size) {
+    throw DataError("compressed image of format '" + message.format + "', " +
+                    std::to_string(message.data.size()) +
+                    " bytes, cannot be decoded: JPEG, PNG, BMP, TIFF and WebP are");
+  }
+  if (std::int64_t{size->width} * size->height > kMostPixels) {
     throw DataError("compressed image of format '" + message.format + "' is " +
                     std::to_string(size->width) + " x " + std::to_string(size->height) +
                     " pixels; at most " + std::to_string(kMostPixels) + " are decoded");

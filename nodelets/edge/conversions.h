@@ -46,7 +46,7 @@ cv::Mat pixelView(const sensor_msgs::Image& message);
 /// CV_8UC1 (mono encodings) or CV_8UC3 in BGR order (everything else that cv_bridge converts).
 /// Shares the message's pixels where they have that form already: see pixelView.
 cv::Mat colorImage(const sensor_msgs::ImageConstPtr& message);
-/// JPEG, PNG and whatever else cv::imdecode reads: CV_8UC1 or CV_8UC3 in BGR order. EXIF rotation
+/// JPEG, PNG, BMP, TIFF or WebP of at most kMostPixels pixels: CV_8UC1 or CV_8UC3 in BGR order. EXIF rotation
 /// is ignored: the pixels are those of camera_info.
 cv::Mat decodedImage(const sensor_msgs::CompressedImage& message);
 /// Encoding after the type: mono8, bgr8, else e.g. 32SC1 or 32FC12.

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cstdlib>
+#include <string>
 
 #ifdef SLF_HAVE_TURBOJPEG
 #include <turbojpeg.h>
@@ -19,16 +20,20 @@ bool startsWith(const Data& data, const std::initializer_list<std::uint8_t>& sta
   return data.size() >= start.size() && std::equal(start.begin(), start.end(), data.begin());
 }
 
-/// `bytes` bytes from `at` on, the most significant first.
+/// `bytes` bytes from `at` on, the most significant first. What is not there counts as 0.
 std::int64_t bigEndian(const Data& data, std::size_t at, int bytes) {
   std::int64_t value = 0;
-  for (int i = 0; i < bytes; ++i) value = value << 8 | data[at + static_cast<std::size_t>(i)];
+  for (int i = 0; i < bytes; ++i, ++at) value = value << 8 | (at < data.size() ? data[at] : 0);
   return value;
 }
 
-std::int64_t littleEndian(const Data& data, std::size_t at) {
-  return std::int64_t{data[at]} | std::int64_t{data[at + 1]} << 8 |
-         std::int64_t{data[at + 2]} << 16 | std::int64_t{data[at + 3]} << 24;
+/// The same, the least significant first.
+std::int64_t littleEndian(const Data& data, std::size_t at, int bytes) {
+  std::int64_t value = 0;
+  for (int i = 0; i < bytes; ++i, ++at) {
+    value |= (at < data.size() ? std::int64_t{data[at]} : 0) << 8 * i;
+  }
+  return value;
 }
 
 /// Declared sizes reach 2^32; the package's are int.
@@ -37,12 +42,11 @@ ImageSize imageSize(std::int64_t width, std::int64_t height) {
   return {static_cast<int>(std::min(width, kMost)), static_cast<int>(std::min(height, kMost))};
 }
 
-/// From the first frame header.
+/// From the first frame header; libjpeg too passes over bytes that are no marker.
 std::optional<ImageSize> jpegSize(const Data& data) {
   for (std::size_t at = 2; at + 9 < data.size();) {
-    if (data[at] != 0xFF) return std::nullopt;
     const std::uint8_t marker = data[at + 1];
-    if (marker == 0xFF) {  // fill byte
+    if (data[at] != 0xFF || marker == 0xFF || marker == 0) {
       ++at;
       continue;
     }
@@ -54,6 +58,37 @@ std::optional<ImageSize> jpegSize(const Data& data) {
   return std::nullopt;
 }
 
+/// From the first directory, whose entries are tag, type (3: 16 bits, 4: 32 bits), count and value.
+std::optional<ImageSize> tiffSize(const Data& data) {
+  const auto number = data[0] == 'M' ? bigEndian : littleEndian;
+  const auto directory = static_cast<std::size_t>(number(data, 4, 4));
+  const std::int64_t entries = number(data, directory, 2);
+  std::int64_t width = 0, height = 0;
+  for (std::int64_t i = 0; i < entries; ++i) {
+    const std::size_t entry = directory + 2 + 12 * static_cast<std::size_t>(i);
+    const std::int64_t tag = number(data, entry, 2);
+    const std::int64_t value = number(data, entry + 8, number(data, entry + 2, 2) == 3 ? 2 : 4);
+    if (tag == 256) width = value;
+    if (tag == 257) height = value;
+  }
+  if (width == 0 || height == 0) return std::nullopt;
+  return imageSize(width, height);
+}
+
+/// Lossy, lossless and extended files hold it in different places.
+std::optional<ImageSize> webpSize(const Data& data) {
+  const std::string kind(data.begin() + 12, data.begin() + 16);
+  if (kind == "VP8 ") {
+    return imageSize(littleEndian(data, 26, 2) & 0x3FFF, littleEndian(data, 28, 2) & 0x3FFF);
+  }
+  if (kind == "VP8L") {
+    const std::int64_t bits = littleEndian(data, 21, 4);
+    return imageSize((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1);
+  }
+  if (kind != "VP8X") return std::nullopt;
+  return imageSize(littleEndian(data, 24, 3) + 1, littleEndian(data, 27, 3) + 1);
+}
+
 }  // namespace
 
 std::optional<ImageSize> encodedSize(const std::vector<std::uint8_t>& data) {
@@ -62,9 +97,13 @@ std::optional<ImageSize> encodedSize(const std::vector<std::uint8_t>& data) {
     return imageSize(bigEndian(data, 16, 4), bigEndian(data, 20, 4));
   }
   if (startsWith(data, {'B', 'M'}) && data.size() >= 26) {
-    const auto height = static_cast<std::int32_t>(littleEndian(data, 22));  // negative: top down
-    return imageSize(littleEndian(data, 18), std::abs(std::int64_t{height}));
+    const auto height = static_cast<std::int32_t>(littleEndian(data, 22, 4));  // < 0: top down
+    return imageSize(littleEndian(data, 18, 4), std::abs(std::int64_t{height}));
   }
+  if (startsWith(data, {'I', 'I', 42, 0}) || startsWith(data, {'M', 'M', 0, 42})) {
+    return tiffSize(data);
+  }
+  if (startsWith(data, {'R', 'I', 'F', 'F'}) && data.size() >= 30) return webpSize(data);
   return std::nullopt;
 }
 

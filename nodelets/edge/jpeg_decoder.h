@@ -13,7 +13,7 @@ namespace semantic_lidar_fusion {
 /// Pixels that a picture may have: more than any camera's.
 constexpr std::int64_t kMostPixels = 1 << 26;
 
-/// The size that the header of a JPEG, PNG or BMP declares; empty for anything else.
+/// The size that the header of a JPEG, PNG, BMP, TIFF or WebP declares; empty for anything else.
 std::optional<ImageSize> encodedSize(const std::vector<std::uint8_t>& data);
 
 /// The pixels of a JPEG image as cv::imdecode gives them, CV_8UC1 or CV_8UC3 in BGR order, without

@@ -3,6 +3,7 @@
 
 import io
 import os
+import struct
 import subprocess
 import sys
 
@@ -206,6 +207,26 @@ def test_pipes_and_devices_are_no_files(tmp_path, make):
             read(path)
     with pytest.raises(DataError, match="is a pipe or a device"):
         files.AtomicFile(path)
+
+
+def test_an_index_that_leads_to_a_message_of_another_topic_is_damage(tmp_path):
+    path = str(tmp_path / "a.bag")
+    with bag_io.BagWriter(path, "none") as writer:
+        writer.write("/tf", TFMessage(), 1)
+        writer.write("/text", String("text"), 1)
+    with bag_io.BagReader(path) as bag:
+        entries = [e for one in bag._bag._connection_indexes.values() for e in one]
+        first, second = (struct.pack("<III", 0, 1, entry.offset) for entry in entries)
+    with open(path, "rb") as file:
+        data = file.read()
+    assert data.count(first) == 1
+    with open(path, "wb") as file:
+        file.write(data.replace(first, second))
+    for read in ("read", "read_raw"):
+        with bag_io.BagReader(path) as bag, pytest.raises(
+            DataError, match="damaged.*another topic"
+        ):
+            list(getattr(bag, read)(["/tf"]))
 
 
 def test_whatever_a_damaged_bag_raises_is_a_data_error(tmp_path):

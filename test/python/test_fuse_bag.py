@@ -846,9 +846,10 @@ def test_output_is_the_input(room, tmp_path):
     assert digest(room.bag) == before
 
 
-def test_full_disk(room, tmp_path):
+@pytest.mark.parametrize("room_for_bytes", [0, 4000, 300_000])
+def test_full_disk(room, tmp_path, room_for_bytes):
     def limit():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room_for_bytes, room_for_bytes))
 
     result = run(room.bag, tmp_path / "out.bag", "--rig", room.rig, preexec_fn=limit)
     assert_fails(result, "out.bag")

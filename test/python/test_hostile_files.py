@@ -6,10 +6,13 @@ import hashlib
 import os
 import resource
 import signal
+import struct
 import subprocess
 import sys
 import time
+import zlib
 
+import numpy as np
 import pytest
 
 bag_factory = pytest.importorskip("bag_factory")
@@ -259,3 +262,39 @@ def test_make_figures_on_a_full_disk(room, tmp_path):
     )
     assert_one_line(done.returncode, done.stderr, "figure")
     assert files_below(tmp_path / "figures") == []
+
+
+def test_a_picture_of_absurd_size_is_refused_before_anything_is_decoded(tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    small = np.zeros((12, 16, 3), np.uint8)
+    png = bytearray(cv2.imencode(".png", small)[1].tobytes())
+    png[16:24] = struct.pack(">II", 20000, 20000)
+    png[29:33] = struct.pack(">I", zlib.crc32(bytes(png[12:29])))
+    (tmp_path / "absurd.png").write_bytes(bytes(png))
+    (tmp_path / "absurd.pgm").write_bytes(b"P5 20000 20000 255\n" + bytes(1000))
+    (tmp_path / "none.png").write_bytes(b"")
+    # OpenCV takes its limit when it is loaded, so that this needs a process of its own.
+    program = (
+        "import sys, resource\n"
+        "from semantic_lidar_fusion.errors import DataError\n"
+        "from semantic_lidar_fusion.pictures import decoded\n"
+        "for name in sys.argv[1:]:\n"
+        "    try:\n"
+        "        decoded(open(name, 'rb').read(), 'color', name)\n"
+        "    except DataError as error:\n"
+        "        print(error)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    names = ["absurd.png", "absurd.pgm", "none.png"]
+    lines = subprocess.run(
+        [sys.executable, "-c", program] + names,
+        cwd=str(tmp_path),
+        env=dict(os.environ, PYTHONPATH=os.pathsep.join(p for p in sys.path if p)),
+        stdout=subprocess.PIPE,
+        universal_newlines=True,
+        check=True,
+    ).stdout.splitlines()
+    for name, line in zip(names[:2], lines):
+        assert line == name + ": not a readable image: more than 67108864 pixels"
+    assert lines[2] == "none.png: not a readable image"
+    assert int(lines[3]) < 500000  # kB; the pixels are 1.2 GB

@@ -14,6 +14,7 @@ from bag_factory import Drive  # noqa: E402
 from live import Said  # noqa: E402
 from rosgraph_msgs.msg import Log  # noqa: E402
 from sensor_msgs.msg import PointCloud2  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
 
 
 class Start(unittest.TestCase):
@@ -45,6 +46,21 @@ class Start(unittest.TestCase):
         with live.launched("fusion.launch", rig="/nowhere/rig.yaml", bond="false"):
             self.said.wait_for(r"/nowhere/rig\.yaml: cannot be read", Log.FATAL)
             self.assertTrue(live.pid_of(live.MANAGER))
+
+    def test_what_an_earlier_launch_left_is_cleared_or_told(self):
+        rospy.set_param("/superpixel_uncertainty/camera", "of_another_rig")
+        rospy.set_param("/rig", {"name": "another"})
+        self.addCleanup(rospy.delete_param, "/rig")
+        with live.folder() as path:
+            made = live.Made(path, Drive(scans=1, points_per_scan=160))
+            with live.launched("fusion.launch", rig=made.rig, bond="false"):
+                for nodelet in ("projection", "superpixel_uncertainty"):
+                    self.said.wait_for(
+                        r"parameter /%s/rig_file counts, and parameter /rig is not read" % nodelet
+                    )
+                told = rospy.wait_for_message("/superpixel_uncertainty/configuration", String, 20)
+                self.assertIn("room", told.data)
+                self.assertFalse(rospy.has_param("/superpixel_uncertainty/camera"))
 
     def test_a_missing_topic_is_named_with_one_that_looks_like_it(self):
         with live.folder() as path:

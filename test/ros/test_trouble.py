@@ -10,6 +10,7 @@ import os
 import sys
 import unittest
 
+import numpy as np
 import rospy
 import rostest
 import yaml
@@ -217,6 +218,21 @@ class Trouble(unittest.TestCase):
             self.assertEqual(known["name"], "room")
             # Of an override, not of the file.
             self.assertEqual(float(known["reference"]["timeout"]), 3.0)
+
+    def test_12_a_pose_beyond_every_float_moves_nothing(self):
+        readings = itertools.count()
+
+        def change(topic, message):
+            if topic == "/tf" and next(readings) % 5 == 2:
+                message.transforms[0].transform.translation.x = 1e39
+            return message
+
+        for cloud in self.run_drive(change):
+            for field in ("x", "y", "z"):
+                self.assertTrue(np.isfinite(cloud[field]).all())
+            self.assertTrue((cloud["status"] == 0).any())
+        self.said.wait_for(r"odom <- base_link .*1e\+39")
+        self.assert_good()
 
 
 if __name__ == "__main__":

@@ -31,6 +31,11 @@ bool isReplaceable(const std::string& path, off_t size, const std::string& progr
   }
 }
 
+void keepToTheEnd(std::unique_ptr<rosbag::Bag> bag) {
+  static auto* const kept = new std::vector<std::unique_ptr<rosbag::Bag>>;
+  kept->push_back(std::move(bag));
+}
+
 }  // namespace
 
 BagOutput::BagOutput(const std::string& path, const std::string& program, Existing existing)
@@ -41,8 +46,14 @@ BagOutput::BagOutput(const std::string& path, const std::string& program, Existi
     std::fprintf(stderr, "%s: note: %s: left by a run that was killed; removed\n", program_.c_str(),
                  leftover.c_str());
   }
-  bag_ = std::make_unique<rosbag::Bag>();
-  guarded([&] { bag_->open(file_->path(), rosbag::bagmode::Write); });
+  auto bag = std::make_unique<rosbag::Bag>();
+  try {
+    bag->open(file_->path(), rosbag::bagmode::Write);
+  } catch (const std::exception& e) {
+    keepToTheEnd(std::move(bag));
+    fail(e.what());
+  }
+  bag_ = std::move(bag);
 }
 
 BagOutput::~BagOutput() {
@@ -84,8 +95,7 @@ void closeBag(std::unique_ptr<rosbag::Bag> bag) {
   try {
     bag->close();
   } catch (...) {
-    static auto* const kept = new std::vector<std::unique_ptr<rosbag::Bag>>;
-    kept->push_back(std::move(bag));
+    keepToTheEnd(std::move(bag));
     throw;
   }
 }

@@ -229,6 +229,11 @@ class BagReader:
         connections = self._bag._get_connections([topic])
         return sorted(to_ns(entry.time) for entry in self._bag._get_entries(connections))
 
+    def _check_topic(self, found: str, names: Sequence[str]) -> None:
+        if _absolute(found) not in names:
+            told = "%s: damaged (its index leads from another topic to a message of %s)"
+            raise DataError(told % (self.path, found))
+
     def read(
         self,
         topics: Optional[Sequence[str]] = None,
@@ -253,6 +258,7 @@ class BagReader:
         if label is not None:
             entries = cli.progress(entries, self.count(names), label)
         for topic, message, stamp in self._guarded(entries):
+            self._check_topic(topic, names)
             yield BagMessage(_absolute(topic), message, to_ns(stamp))
 
     def read_raw(
@@ -278,6 +284,8 @@ class BagReader:
         if label is not None:
             entries = cli.progress(entries, self.count(), label)
         for entry in self._guarded(entries):
+            if topics is not None:
+                self._check_topic(entry.topic, topics)
             header = {key: _text(value) for key, value in entry.connection_header.items()}
             yield RawMessage(_absolute(entry.topic), entry.message, to_ns(entry.timestamp), header)
 

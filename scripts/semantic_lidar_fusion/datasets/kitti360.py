@@ -29,6 +29,7 @@ from semantic_lidar_fusion.datasets import records, rellis
 from semantic_lidar_fusion.datasets.timed_frames import frames_of
 from semantic_lidar_fusion.errors import DataError
 from semantic_lidar_fusion.labels import NO_LABEL, LabelSet
+from semantic_lidar_fusion.pictures import decoded
 
 LIDAR_FRAME, LIDAR_TOPIC = "velodyne", "/velodyne_points"
 CAMERAS = ("image_00", "image_01", "image_02", "image_03")
@@ -244,12 +245,8 @@ def _odometry(path: str, times: Dict[int, int]) -> Optional[Tuple[np.ndarray, np
 
 def _label_values(table: Dict[int, int]) -> Callable[[str], np.ndarray]:
     def values(path: str) -> np.ndarray:
-        import cv2
-
-        ids = cv2.imdecode(
-            np.frombuffer(records.read_bytes(path), dtype=np.uint8), cv2.IMREAD_UNCHANGED
-        )
-        if ids is None or ids.ndim != 2:
+        ids = decoded(records.read_bytes(path), "unchanged", path)
+        if ids.ndim != 2:
             raise DataError("%s: not a label image of one channel" % path)
         return records.map_ids(ids.astype(np.int64), table)
 

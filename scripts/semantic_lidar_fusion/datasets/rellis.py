@@ -30,6 +30,7 @@ from semantic_lidar_fusion.bags import poses
 from semantic_lidar_fusion.cli import warn
 from semantic_lidar_fusion.errors import DataError
 from semantic_lidar_fusion.labels import LabelSet, load_yaml
+from semantic_lidar_fusion.pictures import decoded
 
 LIDAR_FRAME = "os1_cloud_node"
 LIDAR_TOPIC = "/os1_cloud_node/points"
@@ -191,12 +192,7 @@ def _bin_loader(
 
 def _label_image_reader(table: Dict[int, int]) -> Callable[[str], np.ndarray]:
     def read_image(path: str) -> np.ndarray:
-        import cv2
-
-        data = np.frombuffer(records.read_bytes(path), dtype=np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-        if image is None:
-            raise DataError("%s: not a readable image" % path)
+        image = decoded(records.read_bytes(path), "unchanged", path)
         if image.ndim == 3:
             # Some copies repeat the id in three channels.
             if (image[..., :3] != image[..., :1]).any():

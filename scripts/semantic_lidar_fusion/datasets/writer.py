@@ -18,6 +18,7 @@ from semantic_lidar_fusion.bags import bag_io, cloud_io, poses
 from semantic_lidar_fusion.datasets import records
 from semantic_lidar_fusion.errors import ConfigError, DataError, cannot_write
 from semantic_lidar_fusion.labels import NO_LABEL
+from semantic_lidar_fusion.pictures import decoded
 
 FIXED_FRAME = "odom"
 VEHICLE_FRAME = "base_link"
@@ -311,7 +312,7 @@ def _camera_messages(
         info = camera_info(camera, width, height, record.stamp_ns)
         yield record.stamp_ns, "/%s/camera_info" % camera.name, info
         if options.raw_images:
-            image = _decoded(data, record.path)
+            image = _image(data, record.path)
             image.header = info.header
             yield record.stamp_ns, "/%s/image" % camera.name, image
         else:
@@ -374,13 +375,10 @@ def _float_image(values: np.ndarray) -> Any:
     return message
 
 
-def _decoded(data: bytes, path: str) -> Any:
-    import cv2
+def _image(data: bytes, path: str) -> Any:
     from sensor_msgs.msg import Image
 
-    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_ANYCOLOR)
-    if pixels is None:
-        raise DataError("%s: not a readable image" % path)
+    pixels = decoded(data, "anycolor", path)
     message = Image()
     message.height, message.width = pixels.shape[:2]
     message.encoding = "mono8" if pixels.ndim == 2 else "bgr8"

@@ -14,8 +14,10 @@ import yaml
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.bags.bag_io import BagWriter, to_stamp, write_text
 from semantic_lidar_fusion.bags.cloud_io import from_array, point_dtype
+from semantic_lidar_fusion.datasets.records import read_bytes
 from semantic_lidar_fusion.errors import DataError
 from semantic_lidar_fusion.labels import NO_LABEL, LabelSet
+from semantic_lidar_fusion.pictures import decoded
 
 _START_NS = 10**18
 _PERIOD_NS = 10**9
@@ -56,7 +58,6 @@ def write_bag(
     model: segmentation model file; step: pixels between points. Label ids that the class set lacks
     have no truth."""
     cli.require("cv2")
-    import cv2
     from geometry_msgs.msg import TransformStamped
     from sensor_msgs.msg import CameraInfo, Image
     from tf2_msgs.msg import TFMessage
@@ -72,11 +73,8 @@ def write_bag(
         writer.write("/tf_static", TFMessage(transforms), _START_NS, latched=True)
         for number, entry in enumerate(images):
             stamp_ns = _START_NS + number * _PERIOD_NS
-            pixels = cv2.imread(entry.image, cv2.IMREAD_COLOR)
-            truth = cv2.imread(entry.labels, cv2.IMREAD_UNCHANGED)
-            for path, read in ((entry.image, pixels), (entry.labels, truth)):
-                if read is None:
-                    raise DataError("%s: not a readable image" % path)
+            pixels = decoded(read_bytes(entry.image), "color", entry.image)
+            truth = decoded(read_bytes(entry.labels), "unchanged", entry.labels)
             if truth.ndim != 2 or truth.dtype != np.uint8 or truth.shape != pixels.shape[:2]:
                 raise DataError(
                     "%s: must be an 8-bit grey image of the size of %s"

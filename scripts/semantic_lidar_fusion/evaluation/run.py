@@ -108,23 +108,23 @@ class Results:
     def write(self, folder: str, title: str) -> str:
         """Writes everything; returns the report with the list of files."""
         report = "\n".join(["# %s\n" % title] + self.sections)
+        # Before anything is written: the shown bag may turn out to be damaged.
+        shown = html_report.bag_parts(*self.shown) if self.shown is not None else []
         for name, text in self.files.items():
             write_text(os.path.join(folder, name), text)
         for name, draw, arguments in self.plots:
             draw(os.path.join(folder, name), *arguments)
         write_text(os.path.join(folder, REPORT), report)
         write_text(os.path.join(folder, LATEX), tables.latex(self.sections))
-        write_text(os.path.join(folder, PAGE), self._page(folder, title, report))
+        write_text(os.path.join(folder, PAGE), self._page(folder, title, report, shown))
         names = [REPORT, PAGE, LATEX] + sorted(self.files) + [name for name, _, _ in self.plots]
         return report + "\nwritten to %s: %s" % (folder, ", ".join(names))
 
-    def _page(self, folder: str, title: str, report: str) -> str:
-        """Report, plots and the shown bag as one HTML file."""
+    def _page(self, folder: str, title: str, report: str, shown: List[str]) -> str:
+        """Report, plots and the parts of the shown bag as one HTML file."""
         parts = [html_report.from_markdown(report)]
         parts += [html_report.picture(os.path.join(folder, p[0]), p[0][:-4]) for p in self.plots]
-        if self.shown is not None:
-            parts += html_report.bag_parts(*self.shown)
-        return html_report.page(title, parts)
+        return html_report.page(title, parts + shown)
 
 
 @dataclass(frozen=True)

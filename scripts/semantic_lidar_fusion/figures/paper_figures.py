@@ -16,9 +16,11 @@ from semantic_lidar_fusion.bags.cloud_io import FUSED, OCCLUDED, SemanticCloud
 from semantic_lidar_fusion.errors import ConfigError, DataError
 from semantic_lidar_fusion.evaluation.scoring import CLOUD_TOPIC
 from semantic_lidar_fusion.labels import LabelSet
+from semantic_lidar_fusion.pictures import decoded
 from semantic_lidar_fusion.figures.plotting import title_of
 from semantic_lidar_fusion.bags.poses import TransformTree, invert, transform_points
 from semantic_lidar_fusion.rig import CameraConfig, Rig
+from semantic_lidar_fusion.texts import plain_text
 
 _TOP_VIEW_M = 40.0
 # Behind points whose colour says how sure a class is: what is not of the class hardly stands out.
@@ -127,10 +129,8 @@ def rgb_of(message: Any) -> np.ndarray:
     import cv2
 
     if hasattr(message, "format"):
-        pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
-        if pixels is None:
-            raise DataError("a compressed image (%s) cannot be decoded" % message.format)
-        return pixels[..., ::-1]
+        what = "a compressed image of format '%s'" % plain_text(message.format)
+        return decoded(message.data, "color", what)[..., ::-1]
     encoding = message.encoding
     bayer = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
     if encoding.startswith("bayer_") and encoding.endswith("8"):

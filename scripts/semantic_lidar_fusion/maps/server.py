@@ -29,6 +29,7 @@ from semantic_lidar_fusion.maps.reading import DYNAMIC, GONE, labels_and_confide
 from semantic_lidar_fusion.maps.records import BRICK_BITS, heights, positions
 from semantic_lidar_fusion.maps.semantic_map import MapConfig
 from semantic_lidar_fusion.maps.source import class_colors
+from semantic_lidar_fusion.texts import plain_text
 
 _MAP_DEFAULTS = MapConfig()
 SAVE_PREFIX = "semantic_map_"
@@ -390,7 +391,7 @@ class SemanticMapServer:
             "voxels forgotten for want of ~disk_mb": forgotten,
             "processor share": "%.3f" % ((cpu_s - self._cpu_s) / elapsed),
             "compiled module": store.voxels.native if store is not None else "?",
-            "last error": mapper.last_error or "none",
+            "last error": plain_text(mapper.last_error or "none", 2000),
         }
         values.update(drop_values(mapper.drops))
         values.update({"points, " + k: n for k, n in mapper.totals.points.items()})

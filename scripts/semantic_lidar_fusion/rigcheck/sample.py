@@ -21,6 +21,8 @@ from semantic_lidar_fusion.bags.poses import PoseSeries, TransformTree, from_mes
 from semantic_lidar_fusion.cameras import Camera
 from semantic_lidar_fusion.errors import DataError, SemanticLidarFusionError
 from semantic_lidar_fusion.evaluation.scoring import FuseTarget, run_fuse_bag
+from semantic_lidar_fusion.pictures import decoded
+from semantic_lidar_fusion.texts import plain_text
 
 PAIRS = 12  # of consecutive scans
 BEFORE_NS, AFTER_NS = 500_000_000, 500_000_000  # copied around each pair, by record time
@@ -347,7 +349,7 @@ def _decode(raw: RawMessage, camera: CameraSample, into: Dict[int, np.ndarray]) 
     stamp = to_ns(message.header.stamp)
     try:
         if message._type == "sensor_msgs/CompressedImage":
-            pixels = cv2.imdecode(np.frombuffer(message.data, dtype=np.uint8), cv2.IMREAD_COLOR)
+            pixels = decoded(message.data, "color", "format %s" % plain_text(message.format))
         else:
             pixels = image_pixels(message)
     except (cv2.error, DataError, ValueError) as error:

@@ -313,6 +313,46 @@ TEST(CompressedImage, AHeaderOfAbsurdSizeIsRefusedBeforeAnythingIsDecoded) {
   }
 }
 
+TEST(CompressedImage, EveryFormatThatIsDecodedTellsItsSizeFirst) {
+  cv::Mat picture(12, 16, CV_8UC3, cv::Scalar(1, 2, 3));
+  sensor_msgs::CompressedImage tiff, webp, lossless, portable;
+  cv::imencode(".tiff", picture, tiff.data);
+  cv::imencode(".webp", picture, webp.data, {cv::IMWRITE_WEBP_QUALITY, 50});
+  cv::imencode(".webp", picture, lossless.data, {cv::IMWRITE_WEBP_QUALITY, 101});
+  cv::imencode(".ppm", picture, portable.data);
+  for (sensor_msgs::CompressedImage* message : {&tiff, &webp, &lossless}) {
+    ASSERT_EQ(encodedSize(message->data), (ImageSize{16, 12}));
+    EXPECT_EQ(decodedImage(*message).size(), picture.size());
+  }
+  // Values of 16 and of 32 bits, both orders of bytes.
+  const std::vector<std::uint8_t> motorola = {'M', 'M', 0, 42, 0, 0, 0, 8, 0, 2, 1, 0,
+                                              0,   3,   0, 0,  0, 1, 1, 2, 0, 0, 1, 1,
+                                              0,   4,   0, 0,  0, 1, 0, 1, 0, 0};
+  EXPECT_EQ(encodedSize(motorola), (ImageSize{258, 65536}));
+  // Any cut or wild header is read within its bytes.
+  for (std::size_t size = 0; size < tiff.data.size(); ++size) {
+    encodedSize({tiff.data.begin(), tiff.data.begin() + static_cast<std::ptrdiff_t>(size)});
+  }
+  std::vector<std::uint8_t> wild = motorola;
+  std::fill(wild.begin() + 4, wild.begin() + 10, 0xFF);
+  EXPECT_EQ(encodedSize(wild), std::nullopt);
+  // What does not tell it is not decoded, and said with what is.
+  try {
+    decodedImage(portable);
+    ADD_FAILURE() << "is decoded";
+  } catch (const DataError& error) {
+    EXPECT_NE(std::string(error.what()).find("JPEG, PNG, BMP, TIFF and WebP"), std::string::npos);
+  }
+}
+
+TEST(CompressedImage, BytesBetweenTheMarkersOfAJpegHideNoSize) {
+  cv::Mat picture(12, 16, CV_8UC3, cv::Scalar(1, 2, 3));
+  std::vector<std::uint8_t> data;
+  cv::imencode(".jpg", picture, data);
+  data.insert(data.begin() + 2, {0x00, 0x12, 0xFF, 0x00, 0xFF, 0xFF});
+  EXPECT_EQ(encodedSize(data), (ImageSize{16, 12}));
+}
+
 TEST(DecodedImage, JpegOfDamagedDataIsOpencvsToJudge) {
   cv::Mat picture(64, 48, CV_8UC3);
   cv::RNG(5).fill(picture, cv::RNG::UNIFORM, 0, 256);
