@@ -8,10 +8,12 @@
 #include <cmath>
 #include <cstdio>
 #include <limits>
+#include <set>
 #include <utility>
 
 #include "edge/conversions.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/yaml_reader.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -461,7 +463,8 @@ TransformAnswer TfPoseSource::lookup(const std::string& target, const std::strin
     answer.transform = transform(buffer_->lookupTransform(target, source, time).transform);
     return answer;
   } catch (const tf2::TransformException& e) {
-    answer.message = target + " <- " + source + ": " + e.what();
+    const std::string unknown = unknownFrame(target, source);
+    answer.message = target + " <- " + source + ": " + (unknown.empty() ? e.what() : unknown);
     if (dynamic_cast<const tf2::ExtrapolationException*>(&e)) {
       answer.problem = TransformProblem::kNotCovered;
     } else if (dynamic_cast<const tf2::ConnectivityException*>(&e)) {
@@ -476,6 +479,24 @@ TransformAnswer TfPoseSource::lookup(const std::string& target, const std::strin
     answer.problem = TransformProblem::kInvalidRequest;
   }
   return answer;
+}
+
+/// Which of two frames no transform has, with a name that was perhaps meant; empty if both exist.
+std::string TfPoseSource::unknownFrame(const std::string& target, const std::string& source) const {
+  constexpr std::size_t kMostCompared = 1000;
+  std::set<std::string> known;
+  for (const auto& [child, edge] : edges_) {
+    known.insert({child, edge.parent});
+    if (known.size() > kMostCompared) return {};
+  }
+  for (const std::string& frame : {target, source}) {
+    if (known.count(frame) > 0) continue;
+    const std::vector<std::string> names(known.begin(), known.end());
+    const std::string nearest = nearestName(frame, names);
+    return "no transform has a frame '" + frame + "'" +
+           (nearest.empty() ? "" : "; did you mean '" + nearest + "'?");
+  }
+  return {};
 }
 
 /// A frame and those above it.

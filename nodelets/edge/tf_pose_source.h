@@ -120,6 +120,7 @@ class TfPoseSource {
                         const Transform& T_parent_child);
   void noteChangingExtrinsics(const std::string& target, const std::string& source) const;
   std::vector<std::string> ancestors(const std::string& frame) const;
+  std::string unknownFrame(const std::string& target, const std::string& source) const;
   std::optional<Transform> poseFromEdges(StampNs stamp) const;
   std::string jumpText(StampNs stamp) const;
   void addReading(const StampedPose& reading);

@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import traceback
+import warnings
 from types import FrameType
 from typing import Callable, Iterable, Iterator, List, Optional, TypeVar
 
@@ -102,6 +103,9 @@ def run(main: Callable[[], Optional[int]]) -> None:
     shown where the variable SLF_TRACEBACK is set."""
     _open_standard_streams()
     _take_signals()
+    if not os.environ.get("SLF_TRACEBACK"):
+        # numpy's, of an overflow in numbers that the next check refuses with a line of its own.
+        warnings.simplefilter("ignore", RuntimeWarning)
     try:
         if "--version" in sys.argv[1:]:
             from semantic_lidar_fusion.installation import version

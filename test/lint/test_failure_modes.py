@@ -7,7 +7,7 @@ import os
 import re
 
 SOURCE_DIR = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-FAILURE_MODES = 75
+FAILURE_MODES = 79
 
 
 def read(path):
@@ -103,3 +103,16 @@ def test_nothing_waits_inside_tf():
     for path, text in sources("nodelets", "src", "include"):
         for word in ("MessageFilter", "message_filters/", "waitForTransform", "tf2_ros/buffer"):
             assert word not in text, (path, word)
+
+
+def test_what_respawns_waits_and_no_launch_file_enters_a_folder():
+    """A folder of the caller's may be missing or unreadable for the node."""
+    respawning = 0
+    for path in glob.glob(os.path.join(SOURCE_DIR, "launch", "*.launch")):
+        text = read(path)
+        for node in re.findall(r"<node\b[^>]*>", text):
+            if re.search(r'respawn="(?!false)', node):
+                respawning += 1
+                assert re.search(r'respawn_delay="[1-9]', node), (path, node)
+        assert "chdir" not in text and not re.search(r'\bcwd="', text), path
+    assert respawning >= 2

@@ -18,7 +18,10 @@ sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 bag_factory = pytest.importorskip("bag_factory")
 import onnx_factory  # noqa: E402
 import rosbag  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
 
+from semantic_lidar_fusion.bags.bag_io import BagReader  # noqa: E402
+from semantic_lidar_fusion.errors import DataError  # noqa: E402
 from bag_factory import CLASS_NAMES, START_NS, Camera, Drive, read_cloud  # noqa: E402
 
 
@@ -773,6 +776,39 @@ def test_an_index_or_a_record_that_leads_beyond_its_chunk_costs_one_message(room
     for counted in ("/tf", "/left/camera_info", "/front/scores"):
         assert "counted: %s: unusable message: 1" % counted in result.stdout
     assert "counted: scans: unusable: 1" in result.stdout
+
+
+def test_a_bag_of_ros_2_is_told_with_the_cure(room, tmp_path):
+    (tmp_path / "a.db3").write_bytes(b"SQLite format 3\0" + bytes(100))
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    for name in ("a.db3", "a.mcap", "a"):
+        result = run(tmp_path / name, tmp_path / "out.bag", "--rig", room.rig)
+        assert_fails(
+            result, name + ": is a bag of ROS 2; import_dataset.py ros2 makes one of ROS 1"
+        )
+        with pytest.raises(DataError, match="is a bag of ROS 2; import_dataset.py ros2"):
+            BagReader(str(tmp_path / name))
+
+
+def test_odometry_elsewhere_and_misspelt_frames_are_told_with_the_cure(room, tmp_path):
+    with rosbag.Bag(str(room.bag)) as bag, rosbag.Bag(str(tmp_path / "in.bag"), "w") as out:
+        for topic, message, time in bag.read_messages():
+            if topic == "/tf":
+                transform = message.transforms[0]
+                topic, message = "/odom", Odometry(header=transform.header)
+                message.child_frame_id = transform.child_frame_id
+                message.pose.pose.position.x = transform.transform.translation.x
+                message.pose.pose.orientation = transform.transform.rotation
+            out.write(topic, message, time)
+    result = run(tmp_path / "in.bag", tmp_path / "out.bag", "--rig", room.rig)
+    assert result.returncode == 1
+    assert "/odom exists: set odometry.source: topic and odometry.topic: /odom" in result.stderr
+    options = ("--set", "fixed_frame=odon", "--force")
+    result = run(room.bag, tmp_path / "out.bag", "--rig", room.rig, *options)
+    assert result.returncode == 1
+    assert "no transform has a frame 'odon'; did you mean 'odom'?" in result.stderr
 
 
 def test_unindexed_bag(room, tmp_path):

@@ -514,10 +514,21 @@ BAD = [
     ("semantickitti", remove("velodyne", "000002.bin"), "times.txt has 3 lines (no number 2)"),
     ("semantickitti", cut(["labels", "000001.label"], 28), "7 labels; its scan has 8 points"),
     ("semantickitti", replace(["times.txt"], "0\n0\n1\n"), "time 2 is not after"),
+    ("semantickitti", replace(["times.txt"], "0\n1\n1e308\n"), "line 3: 1e+308 s"),
+    ("semantickitti", replace(["poses.txt"], "1e300 " * 12 + "\n"), "not a rotation"),
     ("semantickitti", replace(["poses.txt"], "1 0 0 0\n"), "poses.txt line 1: 4 numbers"),
     ("rellis", remove("camera_info.txt"), "camera_info.txt: no such file"),
     ("rellis", replace(["camera_info.txt"], "1 2 3"), "3 numbers; must be 4"),
     ("rellis", replace(["transforms.yaml"], "a: 1"), "no os1_cloud_node-pylon_camera_node"),
+    (
+        "rellis",
+        replace(
+            ["transforms.yaml"],
+            "os1_cloud_node-pylon_camera_node:\n"
+            "  {q: {x: .nan, y: 0, z: 0, w: 1}, t: {x: 0, y: 0, z: 0}}\n",
+        ),
+        "q must be a unit quaternion",
+    ),
     ("rellis", remove_folder("pylon_camera_node"), "pylon_camera_node: no such folder"),
     (
         "rellis",

@@ -2,11 +2,13 @@
 #include "tools/common/bag_input.h"
 
 #include <sys/stat.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <cerrno>
 #include <cstring>
 #include <exception>
+#include <fstream>
 
 #include "semantic_lidar_fusion/common/error.h"
 
@@ -73,9 +75,17 @@ bool isHeaderOfMessage(Bytes header) {
 void checkFile(const std::string& path) {
   struct stat status {};
   if (::stat(path.c_str(), &status) != 0) throw Error(path + ": " + std::strerror(errno));
-  if (S_ISDIR(status.st_mode)) throw Error(path + ": is a directory, not a bag");
+  static const std::string kRos2 =
+      ": is a bag of ROS 2; import_dataset.py ros2 makes one of ROS 1 of it";
+  if (S_ISDIR(status.st_mode)) {
+    if (::access((path + "/metadata.yaml").c_str(), F_OK) == 0) throw Error(path + kRos2);
+    throw Error(path + ": is a directory, not a bag");
+  }
   if (!S_ISREG(status.st_mode)) throw Error(path + ": is a pipe or a device, not a bag");
   if (status.st_size == 0) throw Error(path + ": is an empty file, not a bag");
+  std::string start(8, '\0');
+  std::ifstream(path, std::ios::binary).read(&start[0], static_cast<std::streamsize>(start.size()));
+  if (start == "SQLite f" || start.compare(0, 5, "\x89MCAP") == 0) throw Error(path + kRos2);
 }
 
 }  // namespace
@@ -159,12 +169,17 @@ const BagInput::Topic* BagInput::find(const std::string& topic) const {
   return found == topics_.end() || found->second.messages == 0 ? nullptr : &found->second;
 }
 
-std::string BagInput::candidates(const std::string& datatype) const {
-  constexpr std::size_t kShown = 8;
+std::vector<std::string> BagInput::namesOf(const std::string& datatype) const {
   std::vector<std::string> names;
   for (const auto& topic : topics_) {
     if (topic.second.datatype == datatype) names.push_back(topic.second.name);
   }
+  return names;
+}
+
+std::string BagInput::candidates(const std::string& datatype) const {
+  constexpr std::size_t kShown = 8;
+  std::vector<std::string> names = namesOf(datatype);
   std::string text = "topics of type " + datatype + ": ";
   if (names.empty()) {
     text = "no topic of type " + datatype + "; all topics: ";

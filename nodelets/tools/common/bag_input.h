@@ -64,6 +64,8 @@ class BagInput {
   };
   /// Null if no bag has such a topic.
   const Topic* find(const std::string& topic) const;
+  /// The topics of one type.
+  std::vector<std::string> namesOf(const std::string& datatype) const;
   /// "/a, /b (2 more)": the topics of one type; all topics if there is none of it.
   std::string candidates(const std::string& datatype) const;
 

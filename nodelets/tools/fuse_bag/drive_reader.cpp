@@ -429,7 +429,12 @@ void DriveReader::finish() {
   for (std::size_t c = 0; c < index_.cameras.size(); ++c) {
     comparePairs(rig_.cameras[c], index_.cameras[c], &drops_);
   }
-  poses_.odometry();
+  const std::vector<std::string> topics = input_.namesOf("nav_msgs/Odometry");
+  if (poses_.odometry().empty() && rig_.motion_enabled && !topics.empty() &&
+      rig_.odometry.source == OdometrySource::kTf) {
+    DropLog::warn(topics.front() +
+                  " exists: set odometry.source: topic and odometry.topic: " + topics.front());
+  }
   for (const std::string& note : poses_.takeNotes()) DropLog::warn("tf: " + note);
 }
 

@@ -20,7 +20,8 @@ std::string count(std::uint64_t n, const std::string& thing) {
 
 /// What a camera gave, and whether the lidar's edges lie on those of its images.
 std::string figuresText(const RigWatch::CameraFigures& figures) {
-  std::string text = percent(figures.points, figures.fused_points) + " of the fused points";
+  std::string text = count(figures.points, "point") + ", " +
+                     percent(figures.points, figures.fused_points) + " of the fused points";
   if (figures.edges.edges > 0) {
     char lift[32];
     std::snprintf(lift, sizeof(lift), "; edges meet with %.2f", figures.edges.lift());

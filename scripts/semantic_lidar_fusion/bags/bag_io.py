@@ -6,6 +6,7 @@ is well, so that a bag with the wanted name is always a whole one. Messages of v
 read and written whether or not that package is installed.
 """
 
+import os
 from types import TracebackType
 from typing import (
     Any,
@@ -142,6 +143,17 @@ class RawMessage(NamedTuple):
         return message
 
 
+def _refuse_ros2(path: str) -> None:
+    start = b""
+    if os.path.isfile(path):
+        with open_file(path) as file:
+            start = file.read(8)
+    in_folder = os.path.exists(os.path.join(path, "metadata.yaml"))
+    if in_folder or start == b"SQLite f" or start.startswith(b"\x89MCAP"):
+        told = "%s: is a bag of ROS 2; import_dataset.py ros2 makes one of ROS 1 of it"
+        raise DataError(told % path)
+
+
 class BagReader:
     """A bag open for reading, as a context manager.
 
@@ -154,6 +166,7 @@ class BagReader:
         import rosbag
 
         self.path = path
+        _refuse_ros2(path)
         self._file = open_file(path)
         try:
             self._bag = rosbag.Bag(self._file, "r")

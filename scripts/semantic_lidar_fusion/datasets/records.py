@@ -162,8 +162,9 @@ def read_calibration(path: str, wanted: Dict[str, int]) -> Dict[str, np.ndarray]
 
 def check_rotation(rotation: np.ndarray, where: str) -> np.ndarray:
     """The rotation (3, 3) itself, if it is one within the rounding of a text file."""
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > 1e-3 or np.linalg.det(rotation) < 0:
+    largest = np.abs(rotation).max()
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max() if largest <= 2.0 else largest
+    if not error <= 1e-3 or np.linalg.det(rotation) < 0:
         raise DataError("%s: not a rotation (off by %.2g)" % (where, error))
     return rotation
 

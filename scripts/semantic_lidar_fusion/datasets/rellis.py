@@ -224,7 +224,7 @@ def _read_transform(path: str) -> np.ndarray:
         t = np.array([float(tree[key]["t"][axis]) for axis in "xyz"])
     except (KeyError, TypeError, ValueError) as error:
         raise DataError("%s: no %s with q {x, y, z, w} and t {x, y, z}" % (path, key)) from error
-    if abs(np.linalg.norm(q) - 1.0) > 1e-3 or not np.isfinite(t).all():
+    if not (abs(np.linalg.norm(q) - 1.0) <= 1e-3 and np.isfinite(t).all()):
         raise DataError("%s: q must be a unit quaternion and t finite" % path)
     return poses.make_transform(poses.to_rotation(q), t)
 

@@ -162,6 +162,8 @@ def _read_times(path: str) -> List[int]:
     times = []
     for number, line in enumerate(records.read_lines(records.require_file(path)), 1):
         seconds = records.parse_numbers(line, 1, "%s line %d" % (path, number))[0]
+        if abs(seconds) > 1e9:
+            raise DataError("%s line %d: %g s; at most 1e9 are" % (path, number, seconds))
         times.append(records.EPOCH_NS + int(round(seconds * 1e9)))
     if not times:
         raise DataError("%s: empty" % path)

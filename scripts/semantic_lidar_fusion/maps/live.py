@@ -25,6 +25,7 @@ from semantic_lidar_fusion.maps.drive import VEHICLE_FRAME, pose_problem
 from semantic_lidar_fusion.maps.map_file import MapHeader, MapWriter, joined_path, merge_files
 from semantic_lidar_fusion.maps.records import BRICK_BITS, pose_of_path
 from semantic_lidar_fusion.maps.semantic_map import COUNTS, MapConfig, VoxelMap
+from semantic_lidar_fusion.texts import plain_text
 
 MAX_WAITING = 10  # clouds
 # A stamp so much older than the last one starts anew: a bag was restarted (ns).
@@ -39,6 +40,8 @@ DROPS = (
     "bad_pose",
     "jumped_back",
 )
+# Of a line or a value of /diagnostics; texts of messages may hold anything.
+LONGEST_TEXT = 2000
 # One warning of a kind in so many seconds.
 WARN_EVERY_S = 30.0
 _MAX_PATH = 1 << 20  # poses kept in memory
@@ -245,7 +248,7 @@ class LiveMapper:
         now = time.monotonic()
         if now - self._warned.get(kind, -WARN_EVERY_S) >= WARN_EVERY_S:
             self._warned[kind] = now
-            self._rospy.logwarn(text)
+            self._rospy.logwarn(plain_text(text, LONGEST_TEXT))
 
     def _use_classes(self, labels: LabelSet) -> None:
         with self.lock:
@@ -255,14 +258,14 @@ class LiveMapper:
                 )
             elif self.store.header.labels != labels:
                 self.last_error = "class_info changed; the map keeps the classes it began with"
-                self._rospy.logwarn(self.last_error)
+                self.warn("class_info", self.last_error)
 
     def _on_class_info(self, message: Any) -> None:
         try:
             self._use_classes(LabelSet.from_class_info(json.loads(message.data)))
-        except (ValueError, AttributeError, ConfigError) as error:
+        except Exception as error:  # whatever a text holds that is no class_info
             self.last_error = "class_info: %s" % error
-            self._rospy.logerr_throttle(30, self.last_error)
+            self.warn("class_info", self.last_error)
 
     def _queue(self, message: Any) -> None:
         with self._arrived:

@@ -21,7 +21,7 @@ from semantic_lidar_fusion.labels import LabelSet
 from semantic_lidar_fusion.maps import formats
 from semantic_lidar_fusion.maps.formats import MAP_FILE
 from semantic_lidar_fusion.maps.ground import GROUND_BAND_M, ground_surface, lowest_heights
-from semantic_lidar_fusion.maps.live import LiveMapper, drop_values, write_snapshot
+from semantic_lidar_fusion.maps.live import LONGEST_TEXT, LiveMapper, drop_values, write_snapshot
 from semantic_lidar_fusion.maps.map_file import MapHeader
 from semantic_lidar_fusion.maps.output import OutputFolder, export_map
 from semantic_lidar_fusion.maps.raster import Costs, Frame2d, flatten
@@ -391,7 +391,7 @@ class SemanticMapServer:
             "voxels forgotten for want of ~disk_mb": forgotten,
             "processor share": "%.3f" % ((cpu_s - self._cpu_s) / elapsed),
             "compiled module": store.voxels.native if store is not None else "?",
-            "last error": plain_text(mapper.last_error or "none", 2000),
+            "last error": plain_text(mapper.last_error or "none", LONGEST_TEXT),
         }
         values.update(drop_values(mapper.drops))
         values.update({"points, " + k: n for k, n in mapper.totals.points.items()})
