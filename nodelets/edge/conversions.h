@@ -46,8 +46,8 @@ cv::Mat pixelView(const sensor_msgs::Image& message);
 /// CV_8UC1 (mono encodings) or CV_8UC3 in BGR order (everything else that cv_bridge converts).
 /// Shares the message's pixels where they have that form already: see pixelView.
 cv::Mat colorImage(const sensor_msgs::ImageConstPtr& message);
-/// JPEG, PNG, BMP, TIFF or WebP of at most kMostPixels pixels: CV_8UC1 or CV_8UC3 in BGR order. EXIF rotation
-/// is ignored: the pixels are those of camera_info.
+/// JPEG, PNG, BMP, TIFF or WebP of at most kMostPixels pixels: CV_8UC1 or CV_8UC3 in BGR order.
+/// EXIF rotation is ignored: the pixels are those of camera_info.
 cv::Mat decodedImage(const sensor_msgs::CompressedImage& message);
 /// Encoding after the type: mono8, bgr8, else e.g. 32SC1 or 32FC12.
 sensor_msgs::ImagePtr imageMessage(const cv::Mat& pixels, const std_msgs::Header& header);
