@@ -20,6 +20,7 @@
 #include "edge/topics.h"
 #include "semantic_lidar_fusion/fusion/calibration_notes.h"
 #include "semantic_lidar_fusion/fusion/lidar_rows.h"
+#include "semantic_lidar_fusion/fusion/report_pixels.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
@@ -69,7 +70,7 @@ class ProjectionNodelet : public FusionNodelet {
     CameraGeometry geometry;
     StampedStore<Semantics> semantics{kKeptImages};
     StampedStore<sensor_msgs::ImageConstPtr> images{kKeptImages};  ///< for the overlay
-    ros::Publisher overlay;
+    ros::Publisher overlay, pixels;
     ros::Subscriber info, selection, scores, share, probabilities, image;
   };
 
@@ -97,6 +98,8 @@ class ProjectionNodelet : public FusionNodelet {
       Camera& camera = *cameras_.back();
       camera.overlay = advertise<sensor_msgs::Image>(
           getNodeHandle(), cameraTopic(camera.config, "projection_overlay"), 2);
+      camera.pixels = advertise<sensor_msgs::PointCloud2>(
+          getNodeHandle(), cameraTopic(camera.config, "points_pixel"), 2);
       // Camera_info is read from the start: it may be latched, or come only once.
       camera.info = subscribe<sensor_msgs::CameraInfo>(
           getNodeHandle(), inputTopic(camera.config, camera.config.camera_info), 8,
@@ -119,7 +122,9 @@ class ProjectionNodelet : public FusionNodelet {
 
   void updateSubscriptions() override {
     bool wanted = isWanted(output_);
-    for (const auto& camera : cameras_) wanted = wanted || isWanted(camera->overlay);
+    for (const auto& camera : cameras_) {
+      wanted = wanted || isWanted(camera->overlay) || isWanted(camera->pixels);
+    }
     for (const auto& camera : cameras_) updateCamera(wanted, camera.get());
     if (wanted && !cloud_subscriber_) {
       reference_subscriber_ = subscribe<sensor_msgs::TimeReference>(
@@ -309,10 +314,10 @@ class ProjectionNodelet : public FusionNodelet {
                                       tf_->source().odometry(), T_vehicle_lidar.transform));
     }
     for (const std::string& note : calibration_notes_.news(rig(), views)) NODELET_WARN_STREAM(note);
-    const bool drawn = std::any_of(cameras_.begin(), cameras_.end(), [](const auto& camera) {
-      return camera->overlay.getNumSubscribers() > 0;
+    const bool with_pixels = std::any_of(cameras_.begin(), cameras_.end(), [](const auto& camera) {
+      return camera->overlay.getNumSubscribers() > 0 || camera->pixels.getNumSubscribers() > 0;
     });
-    const FusionResult result = pipeline_->fuse(cloud, views, drawn);
+    const FusionResult result = pipeline_->fuse(cloud, views, with_pixels);
     if (!result.note.empty() && result.note != told_note_) {
       told_note_ = result.note;
       health().set("lidar", result.note);
@@ -324,7 +329,7 @@ class ProjectionNodelet : public FusionNodelet {
     }
     watchScan(scan, views, T_vehicle_lidar.transform, result.cloud);
     publish(output_, semanticCloudMessage(result.cloud, rig().classes));
-    if (drawn) publishOverlays(scan, result);
+    if (with_pixels) publishPixels(scan, result);
     dropPassed(scan);
   }
 
@@ -419,12 +424,16 @@ class ProjectionNodelet : public FusionNodelet {
     }
   }
 
-  void publishOverlays(const CompletedScan& scan, const FusionResult& result) {
+  /// What each camera's listeners want to know of its pixels.
+  void publishPixels(const CompletedScan& scan, const FusionResult& result) {
     for (const CameraFusionReport& report : result.cameras) {
       const auto found = std::find_if(cameras_.begin(), cameras_.end(), [&](const auto& camera) {
         return camera->config.name == report.name;
       });
       Camera& camera = **found;
+      if (camera.pixels.getNumSubscribers() > 0) {
+        publish(camera.pixels, pixelCloudMessage(*scan.cloud, pixelsOf(report)));
+      }
       if (camera.overlay.getNumSubscribers() == 0) continue;
       const auto index = static_cast<std::size_t>(camera.index);
       const StampNs stamp = scan.views[index].image_stamp;

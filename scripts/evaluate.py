@@ -24,6 +24,7 @@ docs/results.md explains every table.
   evaluate.py drive.bag --rig rig.yaml --masks --out results
   evaluate.py drive.bag --rig rig.yaml --clouds online=recorded.bag --out results
   evaluate.py drive.bag --rig rig.yaml --fit-temperature --fit-on other.bag --out results
+  evaluate.py --board acfr_a0_vlp16 --out results
   evaluate.py --images camvid --model enet.yaml --classes classes.yaml --fit-temperature --out results
 """
 
@@ -111,6 +112,12 @@ def make_parser():
         "--images",
         metavar="DIR",
         help="instead of a drive: images NAME.* with label images NAME_annot.png (class ids)",
+    )
+    parser.add_argument(
+        "--board",
+        metavar="DIR",
+        help="instead of a drive: calibration poses of a board (poseN.jpg, poseN.npz, "
+        "extrinsic_runs.csv); compares `transfer: pixel` and `expected` on them",
     )
     parser.add_argument("--model", metavar="FILE", help="the network for --images")
     parser.add_argument("--classes", metavar="FILE", help="the class set of --images")
@@ -200,12 +207,10 @@ def bags_of(parser, given):
 
 def check(parser, options):
     """Leaves with exit code 2 unless the options fit together."""
-    if bool(options.bags) == bool(options.images):
-        parser.error("give IN.bag or --images, one of them")
-    if options.images:
-        for name in ("model", "classes"):
-            if not getattr(options, name):
-                parser.error("--images needs --" + name)
+    if sum(map(bool, (options.bags, options.images, options.board))) != 1:
+        parser.error("give IN.bag, --images or --board, one of them")
+    alone = "images" if options.images else "board"
+    if options.images or options.board:
         for name in (
             "rig",
             "truth",
@@ -220,7 +225,14 @@ def check(parser, options):
             "compare",
         ):
             if getattr(options, name):
-                parser.error("--images and --%s exclude each other" % name.replace("_", "-"))
+                parser.error("--%s and --%s exclude each other" % (alone, name.replace("_", "-")))
+    if options.images:
+        for name in ("model", "classes"):
+            if not getattr(options, name):
+                parser.error("--images needs --" + name)
+    elif options.board:
+        if options.fit_temperature:
+            parser.error("--board and --fit-temperature exclude each other")
     elif not options.rig and not options.clouds:
         parser.error("give --rig, or --clouds of existing bags")
     for name in ("masks", "registration"):

@@ -348,6 +348,11 @@ sensor_msgs::PointCloud2Ptr compensatedCloudMessage(const Cloud& cloud) {
   return cloudMessage(cloud.stamp, cloud.frame_id, cloud.size(), compensatedCloudBytes(cloud));
 }
 
+sensor_msgs::PointCloud2Ptr pixelCloudMessage(const Cloud& cloud, const CloudPixels& pixels) {
+  return cloudMessage(cloud.stamp, cloud.frame_id, pixels.index.size(),
+                      pixelCloudBytes(cloud, pixels));
+}
+
 Cloud compensatedCloud(const sensor_msgs::PointCloud2& message) {
   checkLayout(message);
   Cloud cloud;

@@ -22,6 +22,7 @@
 
 #include "edge/velodyne_messages.h"
 #include "semantic_lidar_fusion/camera/camera_model.h"
+#include "semantic_lidar_fusion/common/cloud_bytes.h"
 #include "semantic_lidar_fusion/common/label_set.h"
 #include "semantic_lidar_fusion/common/point_cloud.h"
 #include "semantic_lidar_fusion/common/types.h"
@@ -69,6 +70,8 @@ Cloud compensatedCloud(const sensor_msgs::PointCloud2& message);
 /// `points_semantic`; see semanticCloudBytes.
 sensor_msgs::PointCloud2Ptr semanticCloudMessage(const SemanticCloud& cloud,
                                                  const LabelSet& classes);
+/// `<camera>/points_pixel`; see pixelCloudBytes. `cloud`: the one that was fused.
+sensor_msgs::PointCloud2Ptr pixelCloudMessage(const Cloud& cloud, const CloudPixels& pixels);
 
 // --- Decisions
 

@@ -5,6 +5,8 @@
 #include <array>
 #include <cstring>
 #include <limits>
+#include <type_traits>
+#include <utility>
 
 #include "semantic_lidar_fusion/common/error.h"
 
@@ -135,6 +137,30 @@ CloudBytes compensatedCloudBytes(const Cloud& cloud) {
 
 CloudBytes semanticCloudBytes(const SemanticCloud& cloud, const LabelSet& classes) {
   return cloudBytes(cloud.size(), semanticColumns(cloud, classes));
+}
+
+CloudBytes pixelCloudBytes(const Cloud& cloud, const CloudPixels& pixels) {
+  CloudColumns columns;
+  const auto addOfCloud = [&](const char* name, const auto& values) {
+    std::decay_t<decltype(values)> picked;
+    picked.reserve(pixels.index.size());
+    for (const std::uint32_t i : pixels.index) picked.push_back(values[i]);
+    columns.push_back(cloudColumn(name, std::move(picked)));
+  };
+  addOfCloud("x", cloud.x);
+  addOfCloud("y", cloud.y);
+  addOfCloud("z", cloud.z);
+  addOfCloud("intensity", cloud.intensity);
+  addOfCloud("ring", cloud.ring);
+  columns.push_back(cloudColumn("u", pixels.u));
+  columns.push_back(cloudColumn("v", pixels.v));
+  columns.push_back(cloudColumn("cov_uu", pixels.uu));
+  columns.push_back(cloudColumn("cov_uv", pixels.uv));
+  columns.push_back(cloudColumn("cov_vv", pixels.vv));
+  std::vector<std::uint8_t> status;
+  for (const PointStatus value : pixels.status) status.push_back(static_cast<std::uint8_t>(value));
+  columns.push_back(cloudColumn("status", std::move(status)));
+  return cloudBytes(pixels.index.size(), columns);
 }
 
 }  // namespace semantic_lidar_fusion

@@ -210,6 +210,46 @@ CameraNudge readNudge(YamlSection section) {
   return nudge;
 }
 
+/// `count` standard deviations.
+void readDeviations(YamlSection& section, const std::string& key, std::size_t count, double most,
+                    double* values) {
+  std::vector<double> read(values, values + count);
+  section.numbers(key, &read, {0, most});
+  if (read.size() == count) {
+    std::copy(read.begin(), read.end(), values);
+  } else if (section.get(key).IsSequence() && section.get(key).size() != count) {
+    section.problem(key, "must be a list of " + std::to_string(count) + " numbers");
+  }
+}
+
+CameraErrors readCameraErrors(YamlSection section, const std::string& base_directory,
+                              Problems* problems) {
+  CameraErrors errors;
+  Vector6d deviations = Vector6d::Zero();  // m, then deg
+  YamlSection extrinsics = section.child("extrinsics");
+  readDeviations(extrinsics, "deg", 3, 90, deviations.data() + 3);
+  readDeviations(extrinsics, "m", 3, 10, deviations.data());
+  extrinsics.finish();
+  deviations.tail<3>() *= kPi / 180.0;
+  errors.extrinsics.diagonal() = deviations.cwiseAbs2();
+  std::string runs;
+  const std::size_t before = problems->size();
+  readPath(section, "extrinsic_runs", base_directory, &runs);
+  section.number("intrinsics_px", &errors.intrinsics_px, {0, 1000});
+  section.finish();
+  if (runs.empty() || problems->size() > before) return errors;
+  if (!deviations.isZero(0.0)) {
+    section.problem("extrinsic_runs", "must be left out where `extrinsics` is not 0");
+    return errors;
+  }
+  try {
+    errors.extrinsics = readCalibrationRuns(runs).covariance;
+  } catch (const ConfigError& error) {
+    problems->insert(problems->end(), error.problems().begin(), error.problems().end());
+  }
+  return errors;
+}
+
 CameraConfig readCamera(const YAML::Node& node, std::size_t index,
                         const std::string& base_directory, Problems* problems, YamlTree* list) {
   CameraConfig camera;
@@ -261,6 +301,7 @@ CameraConfig readCamera(const YAML::Node& node, std::size_t index,
   section.number("max_time_difference", &camera.max_time_difference_s, {0, kMaxTimeDifference_s});
   section.number("timeout", &camera.timeout_s, kWait);
   section.number("reorder_window", &camera.reorder_window_s, {0, 1});
+  camera.errors = readCameraErrors(section.child("errors"), base_directory, problems);
   section.finish();
   list->add(section.resolved());
   return camera;
@@ -465,6 +506,26 @@ OcclusionConfig readOcclusion(YamlSection section) {
   return occlusion;
 }
 
+RigErrors readErrors(YamlSection section) {
+  RigErrors errors;
+  YamlSection stamps = section.child("stamps_s");
+  stamps.number("lidar", &errors.lidar_stamp_s, {0, 1});
+  stamps.number("camera", &errors.camera_stamp_s, {0, 1});
+  stamps.finish();
+  YamlSection lidar = section.child("lidar");
+  lidar.number("range_m", &errors.lidar.range_m, {0, 10});
+  readDeviations(lidar, "beam_deg", 2, 10, errors.lidar.beam_deg.data());
+  lidar.finish();
+  YamlSection motion = section.child("motion");
+  readDeviations(motion, "velocity_mps", 3, 100, errors.motion.velocity_mps.data());
+  readDeviations(motion, "rate_deg_s", 3, 360, errors.motion.rate_deg_s.data());
+  motion.number("correlation_s", &errors.motion.correlation_s, {0, 1e6, true});
+  motion.number("scale", &errors.motion.scale, {0, 1});
+  motion.finish();
+  section.finish();
+  return errors;
+}
+
 SmoothingConfig readSmoothing(YamlSection section) {
   SmoothingConfig smoothing;
   section.integer("iterations", &smoothing.iterations, 0, SmoothingConfig::kMostIterations);
@@ -528,6 +589,10 @@ Rig readRig(const YAML::Node& root, const std::string& base_directory,
                                {"closest_to_sweep", ImageChoice::kClosestToSweep}});
   rig.segmentation = readSegmentation(section.child("segmentation"), base_directory);
   rig.occlusion = readOcclusion(section.child("occlusion"));
+  rig.errors = readErrors(section.child("errors"));
+  section.choice<TransferRule>(
+      "transfer", &rig.transfer,
+      {{"pixel", TransferRule::kPixel}, {"expected", TransferRule::kExpected}});
   section.choice<OverlapRule>("overlap", &rig.overlap,
                               {{"mean", OverlapRule::kMean},
                                {"product", OverlapRule::kProduct},

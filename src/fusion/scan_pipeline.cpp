@@ -62,6 +62,7 @@ FusionConfig fusionConfig(const Rig& rig) {
   config.class_count = rig.classes.size();
   config.uncertainty = rig.uncertainty;
   config.occlusion = rig.occlusion;
+  config.transfer = rig.transfer;
   config.overlap = rig.overlap;
   config.smoothing = rig.smoothing;
   config.keep_unlabelled = rig.keep_unlabelled;
@@ -211,6 +212,7 @@ CameraView ScanPipeline::view(std::size_t index, const CameraPlace& place,
   view.semantics = image->semantics;
   view.lidar_rows = lidarRows(index, *image);
   view.has_image = true;
+  view.errors = errorsOf(index, place, view.image_ns, reference_ns, odometry, T_vehicle_lidar);
   const bool rolling = place.model->rollingShutter();
   if (!rig_.motion_enabled || (view.image_ns == reference_ns && !rolling)) return view;
 
@@ -229,6 +231,22 @@ CameraView ScanPipeline::view(std::size_t index, const CameraPlace& place,
   if (view.image_ns == reference_ns) return view;
   view.T_camera_lidar = T_camera_vehicle * *T_vehicle_image_vehicle_reference * *T_vehicle_lidar;
   return view;
+}
+
+ViewErrors ScanPipeline::errorsOf(std::size_t index, const CameraPlace& place, StampNs image_ns,
+                                  StampNs reference_ns, const PoseBuffer& odometry,
+                                  const std::optional<Transform>& T_vehicle_lidar) const {
+  std::optional<ViewMotion> motion;
+  if (rig_.motion_enabled && T_vehicle_lidar) {
+    if (const std::optional<Twist> twist = odometry.twist(image_ns)) {
+      motion.emplace();
+      motion->T_camera_vehicle = place.T_camera_lidar * T_vehicle_lidar->inverse(Eigen::Isometry);
+      motion->T_vehicle_lidar = *T_vehicle_lidar;
+      motion->vehicle = *twist;
+    }
+  }
+  return viewErrors(rig_.errors, rig_.cameras[index].errors, motion,
+                    toSeconds(image_ns - reference_ns));
 }
 
 // --- Occlusion, transfer, merging (eq. 12-14)

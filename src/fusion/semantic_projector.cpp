@@ -8,7 +8,8 @@
 #include <string>
 #include <utility>
 
-#include "semantic_lidar_fusion/common/cell_grid.h"
+#include "expected_transfer.h"
+#include "pixel_distribution.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/common/label_set.h"
 #include "semantic_lidar_fusion/common/thread_pool.h"
@@ -112,123 +113,6 @@ void checkViews(const std::vector<CameraView>& views, std::size_t points, int cl
   }
 }
 
-/// Cells of one grid under the pixel centres of another, tabulated per column and row.
-class GridTable {
- public:
-  GridTable(const ImageSize& source, const ImageSize& target)
-      : column_(cellsUnderCentres(source.width, target.width)),
-        row_(cellsUnderCentres(source.height, target.height)) {}
-  /// From `source` through the grid `between`.
-  GridTable(const ImageSize& source, const ImageSize& between, const ImageSize& target)
-      : GridTable(source, between) {
-    const GridTable next(between, target);
-    for (int& column : column_) column = next.column(column);
-    for (int& row : row_) row = next.row(row);
-  }
-
-  int column(int source_column) const { return column_[static_cast<std::size_t>(source_column)]; }
-  int row(int source_row) const { return row_[static_cast<std::size_t>(source_row)]; }
-
- private:
-  std::vector<int> column_, row_;
-};
-
-ImageSize sizeOf(const cv::Mat& image) { return {image.cols, image.rows}; }
-
-/// Whether a pixel of the image may transfer; without a mask, all may.
-class EgoMask {
- public:
-  EgoMask(const cv::Mat& mask, const ImageSize& image)
-      : mask_(mask), table_(mask.empty() ? ImageSize{} : image, sizeOf(mask)) {}
-
-  bool hides(int column, int row) const {
-    return !mask_.empty() && mask_.at<std::uint8_t>(table_.row(row), table_.column(column)) == 0;
-  }
-
- private:
-  cv::Mat mask_;
-  GridTable table_;
-};
-
-/// The class distribution of an image pixel (paper, eq. 3 and 4).
-class PixelDistribution {
- public:
-  PixelDistribution(const ImageSemantics& semantics, const ImageSize& image,
-                    const UncertaintyConfig& config, int class_count)
-      : semantics_(semantics),
-        config_(config),
-        class_count_(class_count),
-        lazy_(semantics.probabilities.empty()),
-        to_superpixel_(image, superpixelSize()),
-        to_score_(lazy_ ? image : ImageSize{}, superpixelSize(), semantics.scores.size()) {}
-
-  /// Asks the memory for what `read` will need.
-  void prefetch(int column, int row) const {
-    const int q_column = to_superpixel_.column(column), q_row = to_superpixel_.row(row);
-    if (!lazy_) {
-      prefetchCell(semantics_.probabilities.ptr<float>(q_row), q_column);
-      return;
-    }
-    __builtin_prefetch(semantics_.share.ptr<float>(q_row) + q_column);
-    const float* scores = semantics_.scores.floatRow(to_score_.row(row));
-    if (scores != nullptr) prefetchCell(scores, to_score_.column(column));
-  }
-
-  /// Writes class_count values that sum to 1; false if they are uniform for want of valid input.
-  /// `scratch` has room for class_count values.
-  bool read(int column, int row, float* scratch, double* out) const {
-    const int q_column = to_superpixel_.column(column), q_row = to_superpixel_.row(row);
-    if (!lazy_) return readProbabilities(q_column, q_row, out);
-    const int score_column = to_score_.column(column), score_row = to_score_.row(row);
-    const float* scores = semantics_.scores.floatRow(score_row);
-    if (scores != nullptr) {
-      scores += static_cast<std::ptrdiff_t>(score_column) * class_count_;
-    } else {
-      semantics_.scores.read(score_column, score_row, scratch);
-      scores = scratch;
-    }
-    const double share = semantics_.share.at<float>(q_row, q_column);
-    return temperedSoftmax(scores, class_count_, share, config_, out);
-  }
-
- private:
-  ImageSize superpixelSize() const {
-    return sizeOf(lazy_ ? semantics_.share : semantics_.probabilities);
-  }
-
-  void prefetchCell(const float* row, int column) const {
-    const float* cell = row + static_cast<std::ptrdiff_t>(column) * class_count_;
-    __builtin_prefetch(cell);
-    __builtin_prefetch(cell + class_count_ - 1);
-  }
-
-  bool readProbabilities(int q_column, int q_row, double* out) const {
-    const float* p = semantics_.probabilities.ptr<float>(q_row) +
-                     static_cast<std::ptrdiff_t>(q_column) * class_count_;
-    double sum = 0;
-    bool valid = true;
-    for (int c = 0; c < class_count_; ++c) {
-      valid = valid && p[c] >= 0;
-      sum += p[c];
-    }
-    if (!valid || !std::isfinite(sum) || !(sum > 0)) {
-      std::fill(out, out + class_count_, 1.0 / class_count_);
-      return false;
-    }
-    // What only rounding to float moved off 1 passes bit for bit.
-    const double factor = std::abs(sum - 1.0) < 1e-6 ? 1.0 : 1.0 / sum;
-    for (int c = 0; c < class_count_; ++c) out[c] = p[c] * factor;
-    return true;
-  }
-
-  const ImageSemantics& semantics_;
-  const UncertaintyConfig& config_;
-  int class_count_;
-  bool lazy_;
-  GridTable to_superpixel_;
-  GridTable to_score_;  ///< from image pixels, through superpixel pixels
-};
-
 /// Order of precedence among cameras: fused, occluded, no image, outside.
 int rank(PointStatus status) {
   switch (status) {
@@ -253,15 +137,31 @@ struct Pixel {
   int column, row;
 };
 
+/// By place of a vote or of a point within the image: its place among the projected points.
+using Places = std::vector<std::uint32_t>;
+
 /// What one camera says of a scan.
 struct CameraOutcome {
   CameraVotes votes;          ///< of visible points
   std::vector<Pixel> pixels;  ///< of the votes
   std::optional<PixelDistribution> distribution;
-  std::vector<std::uint32_t> hidden;     ///< points that a nearer one hides
-  std::vector<std::uint32_t> would_see;  ///< points in view of a camera without an image
+  std::optional<ExpectedTransfer> expected;  ///< if distributions are expected over ellipses
+  std::vector<std::uint32_t> hidden;         ///< points that a nearer one hides
+  std::vector<std::uint32_t> would_see;      ///< points in view of a camera without an image
   CameraFusionReport report;
 };
+
+/// Whether the distributions of a view are expected over the ellipses of its pixels.
+bool isExpected(const CameraView& view, const FusionConfig& config) {
+  return config.transfer == TransferRule::kExpected && view.errors.any();
+}
+
+std::vector<float> pick(const std::vector<float>& values, const Places& places) {
+  std::vector<float> result;
+  result.reserve(places.size());
+  for (const std::uint32_t k : places) result.push_back(values[k]);
+  return result;
+}
 
 /// Projection, occlusion and ego mask in one camera that has an image: who votes, and with which
 /// pixel. The probabilities are still to be read.
@@ -289,6 +189,7 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
   votes.index.reserve(points.size());
   votes.theta.reserve(points.size());
   votes.rig_index = view.rig_index;
+  Places voting, within;
   for (std::size_t k = 0; k < points.size(); ++k) {
     const double u = points.u[k], v = points.v[k];
     if (!inImage(u, v, size)) continue;
@@ -296,6 +197,7 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
     PointStatus status = visible[k] ? PointStatus::kFused : PointStatus::kOccluded;
     if (mask.hides(column, row)) status = PointStatus::kOutsideImages;
     if (with_pixels) {
+      within.push_back(static_cast<std::uint32_t>(k));
       report.index.push_back(points.index[k]);
       report.u.push_back(points.u[k]);
       report.v.push_back(points.v[k]);
@@ -304,6 +206,7 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
     if (status == PointStatus::kFused) {
       if (row + 1 <= first_row || row >= end_row) ++report.beyond_rows;
       outcome->pixels.push_back({column, row});
+      voting.push_back(static_cast<std::uint32_t>(k));
       votes.index.push_back(points.index[k]);
       votes.theta.push_back(points.theta[k]);
     } else if (status == PointStatus::kOccluded) {
@@ -317,32 +220,53 @@ void see(const Cloud& cloud, const CameraView& view, const FusionConfig& config,
     }
   }
   outcome->distribution.emplace(view.semantics, size, config.uncertainty, config.class_count);
+  const PixelDistribution& distribution = *outcome->distribution;
+  const auto covariancesOf = [&](const Places& places) {
+    return pixelCovariances(cloud, points, places, view.T_camera_lidar, model, motion, view.errors,
+                            distribution.cellPx());
+  };
+  if (with_pixels) {
+    report.covariances = covariancesOf(within);
+    report.has_errors = view.errors.any();
+  }
+  if (isExpected(view, config)) {
+    outcome->expected.emplace(pick(points.u, voting), pick(points.v, voting), covariancesOf(voting),
+                              size, mask, distribution, config.class_count);
+  }
   votes.probabilities.resize(outcome->pixels.size() * static_cast<std::size_t>(config.class_count));
 }
 
-/// Votes [begin, end) of a camera.
+/// Votes, or cells of expected distributions, [begin, end) of a camera.
 struct VoteBlock {
   std::size_t camera, begin, end;
   std::size_t nonfinite = 0;
 };
 
-/// Even blocks of all cameras' votes: cameras alone are too few to divide among threads.
-std::vector<VoteBlock> blocksOf(const std::vector<CameraOutcome>& outcomes) {
+/// Even blocks of what all cameras have: cameras alone are too few to divide among threads.
+template <typename Count>
+std::vector<VoteBlock> blocksOf(const std::vector<CameraOutcome>& outcomes, const Count& count) {
   constexpr std::size_t kVotes = 1024;
   std::vector<VoteBlock> blocks;
   for (std::size_t camera = 0; camera < outcomes.size(); ++camera) {
-    const std::size_t votes = outcomes[camera].pixels.size();
-    for (std::size_t begin = 0; begin < votes; begin += kVotes) {
-      blocks.push_back({camera, begin, std::min(votes, begin + kVotes)});
+    const std::size_t all = count(outcomes[camera]);
+    for (std::size_t begin = 0; begin < all; begin += kVotes) {
+      blocks.push_back({camera, begin, std::min(all, begin + kVotes)});
     }
   }
   return blocks;
 }
 
-/// Reads the probabilities of a block of a camera's votes.
+/// Writes the probabilities of a block of a camera's votes.
 void transfer(int class_count, CameraOutcome* outcome, VoteBlock* block) {
   constexpr std::size_t kAhead = 16;  // enough to hide a trip to the memory
   const auto classes = static_cast<std::size_t>(class_count);
+  if (outcome->expected) {
+    for (std::size_t k = block->begin; k < block->end; ++k) {
+      const bool valid = outcome->expected->expect(k, &outcome->votes.probabilities[k * classes]);
+      block->nonfinite += valid ? 0 : 1;
+    }
+    return;
+  }
   const PixelDistribution& distribution = *outcome->distribution;
   const std::vector<Pixel>& pixels = outcome->pixels;
   std::vector<float> scratch(classes);
@@ -452,7 +376,16 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
     }
   });
 
-  std::vector<VoteBlock> blocks = blocksOf(outcomes);
+  std::vector<VoteBlock> cells = blocksOf(outcomes, [](const CameraOutcome& outcome) {
+    return outcome.expected ? outcome.expected->cells() : 0;
+  });
+  pool_->forEach(static_cast<int>(cells.size()), [&](int k) {
+    const VoteBlock& block = cells[static_cast<std::size_t>(k)];
+    CameraOutcome& outcome = outcomes[block.camera];
+    outcome.expected->readCells(*outcome.distribution, block.begin, block.end);
+  });
+  std::vector<VoteBlock> blocks =
+      blocksOf(outcomes, [](const CameraOutcome& outcome) { return outcome.pixels.size(); });
   pool_->forEach(static_cast<int>(blocks.size()), [&](int k) {
     VoteBlock& block = blocks[static_cast<std::size_t>(k)];
     transfer(config_.class_count, &outcomes[block.camera], &block);

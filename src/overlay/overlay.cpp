@@ -255,6 +255,7 @@ std::vector<LegendRow> projectionLegend(const CameraFusionReport& report,
       countItem("occluded", camera(PointStatus::kOccluded), Mark::kRing, kOccluded));
   title.items.push_back(
       countItem("masked", camera(PointStatus::kOutsideImages), Mark::kDot, kMasked));
+  if (report.has_errors) title.items.push_back(textItem("ellipses: 1 sigma", ""));
   scan.items.push_back(textItem("scan:", ""));
   for (std::size_t s = 0; s < in_scan.size(); ++s) {
     scan.items.push_back(countItem(kPointStatusNames[s], in_scan[s], Mark::kNone, {}));
@@ -264,6 +265,38 @@ std::vector<LegendRow> projectionLegend(const CameraFusionReport& report,
                                      Mark::kSwatch, bgrOf(classes[c])));
   }
   return {title, scan, colors};
+}
+
+/// Ellipses of one standard deviation about a sample of the fused points: the first in each cell of
+/// a coarse grid, so that they stay apart.
+void drawEllipses(const CameraFusionReport& report, cv::Mat* canvas) {
+  constexpr int kColumns = 16;
+  const int cell = std::max(1, canvas->cols / kColumns);
+  const int columns = canvas->cols / cell + 1;
+  std::vector<bool> taken(static_cast<std::size_t>(columns) *
+                          static_cast<std::size_t>(canvas->rows / cell + 1));
+  const int thickness = std::max(1, canvas->cols / 900);
+  for (std::size_t k = 0; k < report.index.size(); ++k) {
+    if (report.status[k] != PointStatus::kFused ||
+        !inImage(report.u[k], report.v[k], {canvas->cols, canvas->rows})) {
+      continue;
+    }
+    const auto at = static_cast<std::size_t>(pixelIndex(report.v[k]) / cell * columns +
+                                             pixelIndex(report.u[k]) / cell);
+    if (taken[at]) continue;
+    taken[at] = true;
+    const double uu = report.covariances.uu[k], uv = report.covariances.uv[k],
+                 vv = report.covariances.vv[k];
+    const double mean = 0.5 * (uu + vv), spread = std::hypot(0.5 * (uu - vv), uv);
+    if (!std::isfinite(mean + spread)) continue;
+    const double longest = 4.0 * canvas->cols;  // what is longer leaves the image anyway
+    const cv::Size2d full(2.0 * std::min(longest, std::sqrt(mean + spread)),
+                          2.0 * std::min(longest, std::sqrt(std::max(0.0, mean - spread))));
+    const double angle_deg = 0.5 * std::atan2(2.0 * uv, uu - vv) * 180.0 / CV_PI;
+    const cv::RotatedRect ellipse({report.u[k], report.v[k]}, full, static_cast<float>(angle_deg));
+    cv::ellipse(*canvas, ellipse, cv::Scalar(0, 0, 0), thickness + 2, cv::LINE_AA);
+    cv::ellipse(*canvas, ellipse, cv::Scalar(255, 255, 255), thickness, cv::LINE_AA);
+  }
 }
 
 // ---- Uncertainty ---------------------------------------------------------------------------
@@ -331,7 +364,7 @@ cv::Mat drawProjection(const cv::Mat& image, const CameraFusionReport& report,
                        double time_difference_s) {
   const std::size_t count = report.index.size();
   if (report.u.size() != count || report.v.size() != count || report.status.size() != count ||
-      report.label.size() != count) {
+      report.label.size() != count || (report.has_errors && report.covariances.size() != count)) {
     throw DataError("overlay: the arrays of camera '" + report.name +
                     "' must have equal lengths, one entry for each of " + std::to_string(count) +
                     " points");
@@ -371,6 +404,7 @@ cv::Mat drawProjection(const cv::Mat& image, const CameraFusionReport& report,
   forEach(PointStatus::kOccluded, [&](int column, int row, std::size_t) {
     drawRing(column, row, radius - 0.4, radius + 0.6, kOccluded, &canvas);
   });
+  if (report.has_errors) drawEllipses(report, &canvas);
   return stack(canvas, panel);
 }
 

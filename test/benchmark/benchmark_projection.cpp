@@ -205,13 +205,15 @@ void occlusionPeer(benchmark::State& state) {
 }
 BENCHMARK(occlusionPeer)->Name("occlusion/kdtree+cv::rectangle")->Unit(benchmark::kMicrosecond);
 
-/// All of the reference rig's five cameras, scores and share of 640x402 cells.
-void fuseRig(benchmark::State& state, const OcclusionMode* mode, int threads) {
+/// All of the reference rig's five cameras, scores and share of `cells`. The cameras' poses err by
+/// `deg` around each axis, and 2 cm along it.
+void fuseRig(benchmark::State& state, const OcclusionMode* mode, int threads,
+             const cv::Size& cells = {640, 402}, double deg = 0.0) {
   const auto model = std::make_shared<const CameraModel>(lens(), CameraModelOptions{});
   cv::RNG random(3);
   std::vector<CameraView> views;
   for (int c = 0; c < kCameras; ++c) {
-    cv::Mat scores(402, 640, CV_32FC(kClasses)), share(402, 640, CV_32FC1);
+    cv::Mat scores(cells, CV_32FC(kClasses)), share(cells, CV_32FC1);
     random.fill(scores, cv::RNG::NORMAL, 0.0, 4.0);
     random.fill(share, cv::RNG::UNIFORM, 0.3, 1.0);
     CameraView view;
@@ -220,6 +222,10 @@ void fuseRig(benchmark::State& state, const OcclusionMode* mode, int threads) {
     view.model = model;
     view.T_camera_lidar = view.T_camera_lidar_static = cameraFromLidar(72.0 * c);
     view.has_image = true;
+    if (deg > 0.0) {
+      view.errors.common.diagonal().head<3>().setConstant(4e-4);
+      view.errors.common.diagonal().tail<3>().setConstant(std::pow(deg * kPi / 180.0, 2));
+    }
     view.semantics.scores = ScoreMap(scores, kClasses, {});
     view.semantics.share = share;
     views.push_back(view);
@@ -243,6 +249,16 @@ BENCHMARK_CAPTURE(fuseRig, paper, &OcclusionMode::kPaper, 1)
     ->Unit(benchmark::kMicrosecond);
 BENCHMARK_CAPTURE(fuseRig, adaptive, &OcclusionMode::kAdaptive, 1)
     ->Name("fuse_five_cameras/ours_adaptive")
+    ->Unit(benchmark::kMicrosecond);
+/// With and without known errors, at a network's stride of 8 pixels and at 3.
+BENCHMARK_CAPTURE(fuseRig, stride_8, &OcclusionMode::kAdaptive, 1, {240, 151})
+    ->Name("fuse_five_cameras/ours_adaptive_stride_8")
+    ->Unit(benchmark::kMicrosecond);
+BENCHMARK_CAPTURE(fuseRig, stride_8_uncertain, &OcclusionMode::kAdaptive, 1, {240, 151}, 0.25)
+    ->Name("fuse_five_cameras/ours_adaptive_stride_8_uncertain")
+    ->Unit(benchmark::kMicrosecond);
+BENCHMARK_CAPTURE(fuseRig, uncertain, &OcclusionMode::kAdaptive, 1, {640, 402}, 0.25)
+    ->Name("fuse_five_cameras/ours_adaptive_uncertain")
     ->Unit(benchmark::kMicrosecond);
 BENCHMARK_CAPTURE(fuseRig, off, &OcclusionMode::kOff, 1)
     ->Name("fuse_five_cameras/ours_off")

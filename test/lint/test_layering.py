@@ -33,6 +33,7 @@ CORE = {
     "map": {"common"},
     "projection": {"common", "camera"},
     "smoothing": {"common", "projection"},
+    "uncertainty": {"common", "camera", "projection"},
     "config": {
         "common",
         "superpixel",
@@ -42,6 +43,7 @@ CORE = {
         "projection",
         "smoothing",
         "sync",
+        "uncertainty",
     },
     "fusion": {
         "common",
@@ -51,6 +53,7 @@ CORE = {
         "projection",
         "smoothing",
         "segmentation",
+        "uncertainty",
         "config",
     },
     "overlay": {"common", "fusion"},

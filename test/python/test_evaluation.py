@@ -523,6 +523,92 @@ def test_labelled_images_become_points_on_their_pixels(tmp_path):
         image_truth.find_images(str(tmp_path), "_other")
 
 
+def board_poses(folder, poses=3):
+    """Poses of a board of 0.6 x 0.8 m before a camera whose calibration errs, as its runs do."""
+    import cv2
+    from scipy.spatial.transform import Rotation
+
+    random = np.random.RandomState(4)
+    spread = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.02])
+    # The camera looks along the lidar's x.
+    runs = np.array([-np.pi / 2, 0.0, -np.pi / 2, 0.05, 0.0, -0.2]) + spread * random.randn(40, 6)
+    folder.mkdir()
+    np.savetxt(folder / "extrinsic_runs.csv", runs, delimiter=",", header="roll,pitch,yaw,x,y,z")
+    (folder / "camera_info.yaml").write_text(
+        "distortion_model: fisheye\nwidth: 480\nheight: 320\nD: [0.0, 0.0, 0.0, 0.0]\n"
+        "K: [300.0, 0.0, 240.0, 0.0, 300.0, 160.0, 0.0, 0.0, 1]\n"
+    )
+    really = np.array([-np.pi / 2, 0.0, -np.pi / 2, 0.05, 0.0, -0.2]) + spread * random.randn(6)
+    turn, place = Rotation.from_euler("xyz", really[:3]), really[3:]
+    for number in range(poses):
+        centre = np.array([-0.5 + 0.5 * number, 0.05 * number, 2.0 + 0.3 * number])
+        corners = centre + np.array(
+            [[-0.3, -0.4, 0], [0.3, -0.4, 0], [0.3, 0.4, 0], [-0.3, 0.4, 0]]
+        )
+        azimuth, elevation = np.meshgrid(
+            np.radians(np.arange(-40, 40, 0.5)), np.arange(-0.3, 0.31, 0.02)
+        )
+        rays = np.stack(
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+            ],
+            -1,
+        ).reshape(-1, 3)
+        origin = turn.inv().apply(-place)
+        seen = turn.inv().apply(rays)
+        # To the board's plane, or 6 m away; little parallax hides nothing that matters.
+        hit = origin + seen * ((centre[2] - origin[2]) / seen[:, 2])[:, None]
+        on_board = (np.abs(hit[:, :2] - centre[:2]) < [0.3, 0.4]).all(axis=1)
+        point = np.where(on_board[:, None], hit, origin + 6.0 * seen)
+        xyz = (turn.apply(point) + place).astype(np.float32)
+        np.savez(
+            folder / ("pose%02d.npz" % number),
+            x=xyz[:, 0],
+            y=xyz[:, 1],
+            z=xyz[:, 2],
+            intensity=np.zeros(len(xyz), np.float32),
+            ring=np.zeros(len(xyz), np.uint16),
+            on_board=on_board.astype(np.uint8),
+            board_corners_camera_m=corners,
+        )
+        cv2.imwrite(str(folder / ("pose%02d.png" % number)), np.zeros((320, 480, 3), np.uint8))
+    return folder
+
+
+@needs_program
+def test_expected_distributions_of_a_board_can_be_believed(run_command, tmp_path):
+    folder = board_poses(tmp_path / "poses")
+    code, out, err = run_command("evaluate.py", "--board", folder, "--out", tmp_path / "results")
+    assert code == 0, err
+    with open(tmp_path / "results" / "board.csv") as file:
+        rows = {(row["points"], row["transfer"]): row for row in csv.DictReader(file)}
+    for points in ("all", "next to edges"):
+        pixel, expected = rows[points, "pixel"], rows[points, "expected"]
+        assert int(pixel["scored"]) == int(expected["scored"]) > 500
+        # The calibration is off by a pixel error of 6 px: the hard outline is surely wrong there.
+        assert float(expected["NLL"]) < 0.8 * float(pixel["NLL"])
+        assert float(expected["Brier"]) < float(pixel["Brier"])
+    assert float(rows["next to edges", "expected"]["ECE"]) < float(
+        rows["next to edges", "pixel"]["ECE"]
+    )
+    assert "| all" in out and "expected" in out
+
+
+@needs_program
+def test_a_board_without_its_corners_is_refused(run_command, tmp_path):
+    folder = board_poses(tmp_path / "poses", poses=1)
+    path = folder / "pose00.npz"
+    fields = dict(np.load(path))
+    del fields["board_corners_camera_m"]
+    np.savez(path, **fields)
+    code, _, err = run_command("evaluate.py", "--board", folder, "--out", tmp_path / "results")
+    assert code == 1 and "pose00.npz: no field board_corners_camera_m" in err
+    code, _, err = run_command("evaluate.py", "a.bag", "--board", folder)
+    assert code == 2 and "one of them" in err
+
+
 @needs_program
 def test_rellis_table(optional_data, run_command, tmp_path):
     folder = optional_data("data/rellis3d_000104")

@@ -307,6 +307,48 @@ def test_all_outputs_are_deterministic_and_complete(room):
             assert share.min() > 0 and share.max() == 1
 
 
+ERRORS = (
+    "errors.stamps_s={lidar: 0.001, camera: 0.002}",
+    "errors.lidar={range_m: 0.02, beam_deg: [0.2, 0.1]}",
+    "errors.motion.velocity_mps=[0.1, 0.1, 0.1]",
+    "cameras.front.errors={extrinsics: {deg: [0.5, 0.5, 0.5], m: [0.02, 0.02, 0.02]}}",
+)
+
+
+def test_errors_give_every_pixel_a_covariance_and_spread_its_distribution(room, fused):
+    settings = [part for entry in ERRORS for part in ("--set", entry)]
+    expected = room.fuse("--all", *settings, name="errors.bag")
+    for camera in room.drive.cameras:
+        stamps = [m.header.stamp for m in expected.of("/points_semantic")]
+        messages = expected.of("/%s/points_pixel" % camera.name)
+        assert [m.header.stamp for m in messages] == stamps
+    drive, camera = room.drive, room.drive.cameras[0]
+    pixels = expected.clouds("/front/points_pixel")[0]
+    selection = expected.of("/front/selection")[0].time_ref.to_nsec()
+    stamp = expected.of("/front/points_pixel")[0].header.stamp.to_nsec()
+    uv, _ = pixels_in(drive, camera, world_points(drive, pixels, stamp), selection)
+    assert np.abs(uv - np.stack([pixels["u"], pixels["v"]], axis=1)).max() < 0.1
+    # The camera's own turning alone moves a pixel by its focal length times 0.5 deg.
+    least = np.sqrt(pixels["cov_uu"] * pixels["cov_vv"] - pixels["cov_uv"] ** 2)
+    assert (least > 0).all() and np.isfinite(least).all()
+    cell = camera.score_step**2 / 12.0
+    told = room.fuse("--all", name="exact.bag").clouds("/front/points_pixel")[0]
+    assert told["cov_uu"] == pytest.approx(cell, rel=1e-6)
+    assert (told["cov_uv"] == 0).all()
+    assert np.median(pixels["cov_uu"]) > 2 * cell
+    assert np.array_equal(told["u"], pixels["u"]) and np.array_equal(
+        told["status"], pixels["status"]
+    )
+
+    # Distributions spread, and with `pixel` the errors change no byte of a cloud.
+    ours, theirs = expected.clouds()[0], fused.clouds()[0]
+    assert np.array_equal(ours["status"], theirs["status"])
+    assert ours["entropy"].mean() > 1.02 * theirs["entropy"].mean()
+    pixel = room.fuse(*settings, "--set", "transfer=pixel", name="pixel.bag")
+    for ours, theirs in zip(pixel.of("/points_semantic"), fused.of("/points_semantic")):
+        assert ours.data == theirs.data
+
+
 def test_dense_probabilities_equal_those_of_the_points(room):
     fused = room.fuse("--all", "--set", "overlap=most_central", name="dense.bag")
     drive, camera = room.drive, room.drive.cameras[0]

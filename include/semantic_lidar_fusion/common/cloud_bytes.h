@@ -95,4 +95,14 @@ CloudBytes semanticCloudBytes(const SemanticCloud& cloud, const LabelSet& classe
 /// Colour (0xRRGGBB) of points without a class.
 constexpr std::uint32_t kNoClassRgb = 0x606060;
 
+/// The points of a cloud that lie within one camera's image; arrays of equal length.
+struct CloudPixels {
+  const std::vector<std::uint32_t>& index;  ///< into the cloud
+  const std::vector<float>&u, &v;           ///< px
+  const std::vector<float>&uu, &uv, &vv;    ///< covariance, px^2
+  const std::vector<PointStatus>& status;   ///< in this camera
+};
+/// `<camera>/points_pixel`: x y z intensity f32, ring u16, u v cov_uu cov_uv cov_vv f32, status u8.
+CloudBytes pixelCloudBytes(const Cloud& cloud, const CloudPixels& pixels);
+
 }  // namespace semantic_lidar_fusion

@@ -24,6 +24,7 @@
 #include "semantic_lidar_fusion/smoothing/surface_smoother.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
+#include "semantic_lidar_fusion/uncertainty/errors.h"
 
 namespace YAML {
 class Node;
@@ -74,6 +75,7 @@ struct CameraConfig {
   double max_time_difference_s = 0.05;  ///< key max_time_difference
   double timeout_s = 0.2;               ///< key timeout
   double reorder_window_s = 0.0;        ///< key reorder_window; see SelectorCamera
+  CameraErrors errors;  ///< keys extrinsics {deg, m} or extrinsic_runs, a file; intrinsics_px
 
   /// Whether the rig file says all of the camera that camera_info could.
   bool withoutCameraInfo() const { return lens.calibration && !lens.frame.empty(); }
@@ -173,6 +175,8 @@ struct Rig {
   ImageChoice image_choice = ImageChoice::kClosestToReference;
   SegmentationConfig segmentation;
   OcclusionConfig occlusion;
+  RigErrors errors;
+  TransferRule transfer = TransferRule::kExpected;
   OverlapRule overlap = OverlapRule::kMean;
   SmoothingConfig smoothing;
   bool keep_unlabelled = true;

@@ -16,6 +16,8 @@
 #include "semantic_lidar_fusion/projection/occlusion_mask.h"
 #include "semantic_lidar_fusion/smoothing/surface_smoother.h"
 #include "semantic_lidar_fusion/superpixel/uncertainty.h"
+#include "semantic_lidar_fusion/uncertainty/pixel_covariance.h"
+#include "semantic_lidar_fusion/uncertainty/view_errors.h"
 
 namespace semantic_lidar_fusion {
 
@@ -43,6 +45,7 @@ struct CameraView {
   Transform T_camera_lidar = Transform::Identity();  ///< lidar at t_ref to camera at image_ns
   /// The camera's at image_ns, for a rolling shutter; empty: it stands still, or is not known.
   std::optional<Twist> motion;
+  ViewErrors errors;  ///< what is known of the errors of this view; all 0: nothing
   ImageSemantics semantics;
   RowBand lidar_rows;  ///< in which superpixels were made; points beyond are counted
   /// Of each point of the cloud whether the camera sees it, where that is known; empty: the
@@ -54,6 +57,7 @@ struct FusionConfig {
   int class_count = 0;
   UncertaintyConfig uncertainty;
   OcclusionConfig occlusion;
+  TransferRule transfer = TransferRule::kExpected;
   OverlapRule overlap = OverlapRule::kMean;
   SmoothingConfig smoothing;
   bool keep_unlabelled = true;  ///< false: only fused points come out, as in the paper
@@ -66,6 +70,8 @@ struct CameraFusionReport {
   std::string name;
   std::vector<std::uint32_t> index;  ///< into the input cloud: the points within the image
   std::vector<float> u, v;           ///< px
+  PixelCovariances covariances;      ///< of (u, v), see pixel_covariance.h
+  bool has_errors = false;           ///< the view's errors are known: see ViewErrors::any
   std::vector<PointStatus> status;   ///< kFused, kOccluded or kOutsideImages (ego mask)
   std::vector<std::uint8_t> label;   ///< the point's label over all cameras, kNoLabel = none
   std::size_t nonfinite = 0;  ///< visible points given a uniform P: score not finite, share outside

@@ -13,14 +13,15 @@ namespace semantic_lidar_fusion {
 /// Points over the image: fused ones as discs in their class colour, with a shaded rim; occluded
 /// ones as hollow black rings with a white halo; those on masked pixels as grey dots. Discs have a
 /// radius of some 2 px at 1242x375 and grow with the image, but shrink where points are dense.
-/// Beneath the image a legend: the camera's name, `time_difference_s` (image minus t_ref), this
-/// camera's points per status, the scan's points per status (of `cloud`) and every class with its
-/// colour and its number of points in this camera.
+/// Where the errors of the view are known, fused points here and there have the ellipse of one
+/// standard deviation of their pixel. Beneath the image a legend: the camera's name,
+/// `time_difference_s` (image minus t_ref), this camera's points per status, the scan's points per
+/// status (of `cloud`) and every class with its colour and its number of points in this camera.
 ///
 /// `image`: CV_8UC1, CV_8UC3 (BGR) or CV_8UC4, as large as the camera's. Gives CV_8UC3; the image
 /// stands at the top left, the picture is at least 320 px wide, and its size depends only on the
-/// image's size, the camera's name and `classes`. Throws DataError on an empty image or another
-/// type.
+/// image's size, the camera's name, `classes` and whether errors are known. Throws DataError on an
+/// empty image or another type.
 cv::Mat drawProjection(const cv::Mat& image, const CameraFusionReport& report,
                        const SemanticCloud& cloud, const LabelSet& classes,
                        double time_difference_s);

@@ -31,7 +31,8 @@ options:
   --rig FILE       the rig file (see config/usyd.yaml)
   --set KEY=VALUE  override a key of the rig file, e.g. --set occlusion.mode=paper; repeatable
   --all            also write for each camera superpixels, share, probabilities, scores (where the
-                   package's own network made them), projection_overlay and uncertainty_overlay
+                   package's own network made them), projection_overlay, uncertainty_overlay
+                   and points_pixel (pixels and their covariances)
   --no-tf          leave out /tf and /tf_static, without which OUT.bag shows and maps by itself
   --truth visibility
                    let the bag's /points_truth, and no mask, say which camera sees which point

@@ -131,7 +131,10 @@ void FusedOutput::writeScan(const ScanTask& task, const OutputTask& result) {
   const StampNs reference_ns = result.rigid.cloud.stamp;
   writer_.writeScan(task.scan.times.interval.first_ns, reference_ns, task.scan.image_stamps,
                     result.clouds);
-  if (all_) writer_.writeOverlays(result.result, task.images, result.views, reference_ns);
+  if (all_) {
+    writer_.writePixels(result.rigid.cloud, result.result);
+    writer_.writeOverlays(result.result, task.images, result.views, reference_ns);
+  }
   report_.countScan(result.result.cloud.points);
 }
 

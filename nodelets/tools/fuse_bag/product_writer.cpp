@@ -8,6 +8,7 @@
 #include "edge/conversions.h"
 #include "edge/topics.h"
 #include "edge/version.h"
+#include "semantic_lidar_fusion/fusion/report_pixels.h"
 #include "semantic_lidar_fusion/overlay/overlay.h"
 
 namespace semantic_lidar_fusion {
@@ -73,6 +74,16 @@ void ProductWriter::writeOverlays(const FusionResult& result,
                                          rig_.classes, toSeconds(views[c].image_ns - reference_ns));
     output_.write(topic(c, "projection_overlay"), images[c]->stamp,
                   *imageMessage(drawn, header(*images[c])));
+  }
+}
+
+void ProductWriter::writePixels(const Cloud& cloud, const FusionResult& result) {
+  for (std::size_t c = 0; c < rig_.cameras.size(); ++c) {
+    for (const CameraFusionReport& report : result.cameras) {
+      if (report.name != rig_.cameras[c].name) continue;
+      output_.write(topic(c, "points_pixel"), cloud.stamp,
+                    *pixelCloudMessage(cloud, pixelsOf(report)));
+    }
   }
 }
 

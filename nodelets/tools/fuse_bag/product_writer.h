@@ -38,6 +38,8 @@ class ProductWriter {
   void writeOverlays(const FusionResult& result,
                      const std::vector<std::shared_ptr<ImageTask>>& images,
                      const std::vector<CameraView>& views, StampNs reference_ns);
+  /// Pixels and their covariances, camera by camera. `cloud`: the one that was fused.
+  void writePixels(const Cloud& cloud, const FusionResult& result);
   void copyTransforms(const std::vector<rosbag::MessageInstance>& transforms);
 
  private:

@@ -12,7 +12,7 @@ from typing import Any, Callable, Dict, List, NamedTuple, Optional, Sequence, Tu
 from semantic_lidar_fusion import cli
 from semantic_lidar_fusion.bags.bag_io import BagReader, write_text
 from semantic_lidar_fusion.errors import DataError
-from semantic_lidar_fusion.evaluation import html_report, image_truth, scoring, tables
+from semantic_lidar_fusion.evaluation import board, html_report, image_truth, scoring, tables
 from semantic_lidar_fusion.evaluation.calibration import Variant
 from semantic_lidar_fusion.evaluation.metrics import Visibility
 from semantic_lidar_fusion.evaluation.scoring import (
@@ -153,6 +153,7 @@ class Options:
     voxel: float = 0.2
     frame: Optional[str] = None
     images: Optional[str] = None
+    board: Optional[str] = None
     model: Optional[str] = None
     classes: Optional[str] = None
     label_suffix: str = "_annot"
@@ -225,6 +226,8 @@ def evaluate(options: Options) -> str:
             title = _evaluate_images(options, results, workspace)
         elif options.registration:
             title = _evaluate_registration(options, results, workspace)
+        elif options.board:
+            title = _evaluate_board(options, results, workspace)
         elif options.masks:
             title = _evaluate_masks(options, results, workspace)
         else:
@@ -500,6 +503,16 @@ def _compare(
         "%s." % (source, target)
     )
     results.add_temperatures(compared, note)
+
+
+def _evaluate_board(options: Options, results: Results, workspace: str) -> str:
+    folder = options.board or ""
+    table, csv = board.compare(
+        folder, find_fuse_bag(options.fuse_bag), list(options.settings), workspace
+    )
+    results.sections += ["## Transfer from a board of known outline\n", table]
+    results.files["board.csv"] = csv
+    return "Evaluation of the board in %s" % os.path.basename(os.path.abspath(folder))
 
 
 def _evaluate_images(options: Options, results: Results, workspace: str) -> str:

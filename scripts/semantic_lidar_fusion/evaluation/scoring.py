@@ -61,6 +61,7 @@ PAPER = (
     ("uncertainty.temperature", "1"),
     ("uncertainty.exponent", "2"),
     ("uncertainty.blend", "0"),
+    ("transfer", "pixel"),
     ("overlap", "mean"),
     ("smoothing.iterations", "0"),
 )

@@ -103,7 +103,8 @@ cameras:
   - {name: c0, namespace: /a/b, image: i, camera_info: ci, scores: s, transport: compressed,
      rectified: true, input: probabilities, mask: usyd.yaml, score_scale: -0.5, score_offset: 3,
      max_theta_deg: 50, lidar_rows: {first: 0.25, last: 0.75}, time_offset: 0.25, max_time_difference: 0, timeout: 1.5,
-     reorder_window: 0.1}
+     reorder_window: 0.1,
+     errors: {extrinsics: {deg: [0, 0.5, 1], m: [0.01, 0.02, 0]}, intrinsics_px: 1.5}}
   - {name: c1}
 lidar: {input: points, topic: /ouster/points, model: VLP-32C, frame: /os, min_range_m: 1,
         max_range_m: 90, largest_coordinate_m: 500, longest_scan_s: 2, time_field: t, time_unit: us, time_reference: scan_end,
@@ -122,6 +123,9 @@ image_choice: closest_to_sweep
 segmentation: {model: usyd.yaml, mode: on_request}
 occlusion: {mode: paper, vertical_step_deg: 2, horizontal_step_deg: 0.1, depth_margin_m: 0,
             depth_margin_ratio: 0.2}
+errors: {stamps_s: {lidar: 0.001, camera: 0.002}, lidar: {range_m: 0.03, beam_deg: [0.2, 0.1]},
+         motion: {velocity_mps: [0.1, 0.2, 0.3], rate_deg_s: [1, 2, 3], correlation_s: 2, scale: 0.01}}
+transfer: pixel
 overlap: most_central
 smoothing: {iterations: 4, distance_m: 0.5, intensity: 0}
 keep_unlabelled: false
@@ -147,6 +151,11 @@ threads: 3
   EXPECT_EQ(camera.max_time_difference_s, 0);
   EXPECT_EQ(camera.timeout_s, 1.5);
   EXPECT_EQ(camera.reorder_window_s, 0.1);
+  Vector6d deviations;
+  deviations << 0.01, 0.02, 0, 0, 0.5 * kPi / 180, kPi / 180;
+  EXPECT_TRUE(camera.errors.extrinsics.isApprox(
+      Matrix6d(deviations.cwiseAbs2().asDiagonal().toDenseMatrix())));
+  EXPECT_EQ(camera.errors.intrinsics_px, 1.5);
   EXPECT_EQ(rig.lidar.input, LidarInput::kPoints);
   EXPECT_EQ(rig.lidar.topic, "/ouster/points");
   EXPECT_EQ(rig.lidar.model, findLidarSpec("VLP32C"));
@@ -195,6 +204,15 @@ threads: 3
   EXPECT_EQ(rig.occlusion.horizontal_step_deg, 0.1);
   EXPECT_EQ(rig.occlusion.depth_margin_m, 0);
   EXPECT_EQ(rig.occlusion.depth_margin_ratio, 0.2);
+  EXPECT_EQ(rig.errors.lidar_stamp_s, 0.001);
+  EXPECT_EQ(rig.errors.camera_stamp_s, 0.002);
+  EXPECT_EQ(rig.errors.lidar.range_m, 0.03);
+  EXPECT_EQ(rig.errors.lidar.beam_deg, Eigen::Vector2d(0.2, 0.1));
+  EXPECT_EQ(rig.errors.motion.velocity_mps, Eigen::Vector3d(0.1, 0.2, 0.3));
+  EXPECT_EQ(rig.errors.motion.rate_deg_s, Eigen::Vector3d(1, 2, 3));
+  EXPECT_EQ(rig.errors.motion.correlation_s, 2.0);
+  EXPECT_EQ(rig.errors.motion.scale, 0.01);
+  EXPECT_EQ(rig.transfer, TransferRule::kPixel);
   EXPECT_EQ(rig.overlap, OverlapRule::kMostCentral);
   EXPECT_EQ(rig.smoothing.iterations, 4);
   EXPECT_EQ(rig.smoothing.distance_m, 0.5);
@@ -286,6 +304,19 @@ TEST(RigTest, EachBrokenRuleIsNamedWithKeyAndValue) {
             "rig.yaml: ocluson = (a map of 0): unknown key; did you mean "
             "'occlusion'?"},
            {"<<: {a: 1}", "rig.yaml: << = (a map of 1): unknown key; known here: name, "},
+           {"transfer: mean", "rig.yaml: transfer = mean: must be one of pixel, expected"},
+           {"errors: {stamps: 1}",
+            "rig.yaml: errors.stamps = 1: unknown key; did you mean 'stamps_s'?"},
+           {"errors: {stamps_s: {lidar: -1}}", "rig.yaml: errors.stamps_s.lidar = -1: must be "},
+           {"errors: {lidar: {beam_deg: [0.1]}}",
+            "rig.yaml: errors.lidar.beam_deg = (a list of 1): must be a list of 2 numbers"},
+           {"errors: {lidar: {beam_deg: 0.1}}",
+            "rig.yaml: errors.lidar.beam_deg = 0.1: must be a list of numbers"},
+           {"errors: {motion: {velocity_mps: [0, .inf, 0]}}",
+            "rig.yaml: errors.motion.velocity_mps[1] = .inf: must be "},
+           {"errors: {motion: {correlation_s: 0}}",
+            "rig.yaml: errors.motion.correlation_s = 0: must be "},
+           {"errors: {motion: {scale: 2}}", "rig.yaml: errors.motion.scale = 2: must be "},
            {"overlap: last",
             "rig.yaml: overlap = last: must be one of mean, product, "
             "nearest_in_time, most_central, geometric_mean"},
@@ -515,6 +546,37 @@ TEST(RigTest, ReadsLensFilesAndShutters) {
       problemOf("classes: classes_usyd12.yaml\ncameras: [{name: a, " + lens + "}]");
   EXPECT_NE(problem.find(path + ": coefficients: alpha = 1.6: must lie in 0..1"), std::string::npos)
       << problem;
+}
+
+TEST(RigTest, TakesTheWholeCovarianceOfCalibrationRuns) {
+  const TemporaryFolder folder;
+  const std::string path = folder.path() + "/runs.csv";
+  {
+    std::ofstream file(path);
+    // Roll and y of the camera's pose hang together.
+    for (int k = -4; k <= 4; ++k) file << 1e-3 * k << ",0,0,0.1," << 0.01 * k << ",0.2\n";
+  }
+  const auto rigOf = [](const std::string& errors) {
+    return "classes: classes_usyd12.yaml\ncameras: [{name: a, errors: {" + errors + "}}]";
+  };
+  const Rig rig = parse(rigOf("extrinsic_runs: " + path));
+  const Matrix6d& covariance = rig.cameras.at(0).errors.extrinsics;
+  // Of -4..4 the variance is 7.5. The camera's motion is the run's turned around: both change sign.
+  EXPECT_NEAR(covariance(3, 3), 7.5e-6, 1e-9);
+  EXPECT_NEAR(covariance(1, 1), 7.5e-4, 1e-7);
+  EXPECT_NEAR(covariance(1, 3), 7.5e-5, 1e-8);
+  EXPECT_EQ(rigFromYaml(parseYaml(rig.yaml, "x"), "/nowhere", "x.yaml").yaml, rig.yaml);
+
+  EXPECT_EQ(problemOf(rigOf("extrinsics: {deg: [1, 1, 1]}, extrinsic_runs: " + path)),
+            "rig.yaml: cameras.a.errors.extrinsic_runs = " + path +
+                ": must be left out where `extrinsics` is not 0");
+  EXPECT_EQ(problemOf(rigOf("extrinsic_runs: usyd.yaml")).find(kConfigFolder + "/usyd.yaml "), 10u);
+  EXPECT_EQ(
+      problemOf(rigOf("extrinsics: {deg: [1, 1]}")),
+      "rig.yaml: cameras.a.errors.extrinsics.deg = (a list of 2): must be a list of 3 numbers");
+  EXPECT_EQ(problemOf(rigOf("intrinsics_px: -1"))
+                .find("rig.yaml: cameras.a.errors.intrinsics_px = -1: must be "),
+            0u);
 }
 
 TEST(RigTest, SaysTheResolvedPathOfAMissingFile) {

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 #include <gtest/gtest.h>
 
+#include <Eigen/Dense>
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -8,6 +9,7 @@
 #include <map>
 #include <memory>
 #include <numeric>
+#include <opencv2/imgproc.hpp>
 #include <random>
 #include <string>
 
@@ -558,6 +560,101 @@ TEST(SemanticProjector, GivesTheSameBytesForEveryNumberOfThreads) {
       }
     }
   }
+}
+
+/// The views of a scene, whose cameras' poses err by this around and along each axis.
+std::vector<CameraView> erring(std::vector<CameraView> views, double deg, double m) {
+  for (CameraView& view : views) {
+    view.errors.common.diagonal().head<3>().setConstant(m * m);
+    view.errors.common.diagonal().tail<3>().setConstant(std::pow(deg * M_PI / 180, 2));
+  }
+  return views;
+}
+
+/// Equation of the transfer, point by point: the mean of P over nine points of the ellipse, read
+/// where they are in the image and not masked.
+TEST(SemanticProjector, ExpectsDistributionsOverTheEllipse) {
+  const Scene scene(8);
+  FusionConfig config;
+  config.class_count = Scene::kClasses;
+  int compared = 0, different = 0, dropped = 0;
+  for (CameraView view : erring(scene.views, 3.0, 0.03)) {
+    if (view.semantics.probabilities.empty() || !view.has_image) continue;
+    // A score for each pixel, so that no axis is negligible.
+    const ImageSize size = view.model->imageSize();
+    cv::resize(view.semantics.probabilities, view.semantics.probabilities,
+               {size.width, size.height}, 0, 0, cv::INTER_NEAREST);
+    if (view.ego_mask.empty()) {
+      std::mt19937 random(2);
+      view.ego_mask = randomMask({97, 61}, &random);
+    }
+    const FusionResult result = SemanticProjector(config).fuse(scene.cloud, {view});
+    const CameraFusionReport& report = result.cameras.at(0);
+    ASSERT_EQ(report.covariances.size(), report.index.size());
+    for (std::size_t k = 0; k < report.index.size(); ++k) {
+      if (report.status[k] != PointStatus::kFused) continue;
+      Eigen::Matrix2d covariance;
+      covariance << report.covariances.uu[k], report.covariances.uv[k], report.covariances.uv[k],
+          report.covariances.vv[k];
+      const Eigen::SelfAdjointEigenSolver<Eigen::Matrix2d> axes(covariance);
+      std::vector<double> want(Scene::kClasses, 0.0);
+      double total = 0;
+      for (const int a : {0, 1, -1}) {
+        for (const int b : {0, 1, -1}) {
+          const Eigen::Vector2d at =
+              Eigen::Vector2d(report.u[k], report.v[k]) +
+              std::sqrt(3.0) * (a * std::sqrt(axes.eigenvalues()[0]) * axes.eigenvectors().col(0) +
+                                b * std::sqrt(axes.eigenvalues()[1]) * axes.eigenvectors().col(1));
+          const double weight = (a == 0 ? 4.0 : 1.0) * (b == 0 ? 4.0 : 1.0) / 36.0;
+          const int column = static_cast<int>(std::floor(at.x() + 0.5));
+          const int row = static_cast<int>(std::floor(at.y() + 0.5));
+          const bool inside = column >= 0 && column < size.width && row >= 0 && row < size.height;
+          if (!inside || view.ego_mask.at<std::uint8_t>(
+                             gridCell(row, size.height, view.ego_mask.rows),
+                             gridCell(column, size.width, view.ego_mask.cols)) == 0) {
+            ++dropped;
+            continue;
+          }
+          const float* p = view.semantics.probabilities.ptr<float>(row) + column * Scene::kClasses;
+          for (int c = 0; c < Scene::kClasses; ++c) want[c] += weight * p[c];
+          total += weight;
+        }
+      }
+      ++compared;
+      const float* got = &result.cloud.probabilities[report.index[k] * Scene::kClasses];
+      double largest = 0;
+      for (int c = 0; c < Scene::kClasses; ++c) {
+        largest = std::max(largest, std::abs(got[c] - want[c] / total));
+      }
+      // A point next to a pixel's border may be rounded to the other side.
+      different += largest > 1e-5 ? 1 : 0;
+    }
+  }
+  EXPECT_GT(compared, 150);
+  EXPECT_GT(dropped, 100);
+  EXPECT_LE(different, compared / 100);
+}
+
+TEST(SemanticProjector, ExpectsWithoutErrorsWhatPixelsSay) {
+  const Scene scene(8);
+  FusionConfig config;
+  config.class_count = Scene::kClasses;
+  config.transfer = TransferRule::kPixel;
+  const FusionResult pixel = SemanticProjector(config).fuse(scene.cloud, scene.views);
+  // What errs does not matter where distributions are those of pixels,
+  expectSameBytes(pixel, SemanticProjector(config).fuse(scene.cloud, erring(scene.views, 3, 0.1)));
+  config.transfer = TransferRule::kExpected;
+  expectSameBytes(pixel, SemanticProjector(config).fuse(scene.cloud, scene.views));
+  // nor where it is small next to a score's cell.
+  expectSameBytes(pixel,
+                  SemanticProjector(config).fuse(scene.cloud, erring(scene.views, 1e-3, 1e-6)));
+  const FusionResult expected =
+      SemanticProjector(config).fuse(scene.cloud, erring(scene.views, 3, 0.1));
+  EXPECT_NE(expected.cloud.probabilities, pixel.cloud.probabilities);
+  EXPECT_EQ(expected.cloud.points.status, pixel.cloud.points.status);
+  config.threads = 3;
+  expectSameBytes(expected,
+                  SemanticProjector(config).fuse(scene.cloud, erring(scene.views, 3, 0.1)));
 }
 
 TEST(SemanticProjector, TellsOfPixelsOnlyIfAsked) {

@@ -101,6 +101,37 @@ TEST(DrawProjection, ShowsOccludedPointsAsHollowRings) {
   EXPECT_EQ(at(picture, 198, 50), kBlack);
 }
 
+TEST(DrawProjection, ShowsTheEllipsesOfASampleWhereErrorsAreKnown) {
+  CameraFusionReport report;
+  // The second lies in the cell of the first, the third is hidden.
+  addPoint(&report, 300, 150, PointStatus::kFused, 0);
+  addPoint(&report, 302, 150, PointStatus::kFused, 0);
+  addPoint(&report, 700, 150, PointStatus::kOccluded);
+  addPoint(&report, 900, 150, PointStatus::kFused, 0);
+  const float nan = std::numeric_limits<float>::quiet_NaN();
+  report.covariances.uu = {400, 9, 400, nan};
+  report.covariances.uv = {0, 0, 0, nan};
+  report.covariances.vv = {100, 9, 100, nan};
+  const cv::Mat without = draw(plainImage(), report);
+  report.has_errors = true;
+  const cv::Mat with = draw(plainImage(), report);
+  const cv::Rect all(0, 0, 1242, 375);
+  cv::Mat ellipse;
+  cv::compare(with(all).clone().reshape(1), without(all).clone().reshape(1), ellipse, cv::CMP_NE);
+  cv::Mat rows = ellipse.reshape(3);
+  cv::Mat any;
+  cv::inRange(rows, cv::Scalar(0, 0, 0), cv::Scalar(0, 0, 0), any);
+  const cv::Rect box = cv::boundingRect(255 - any);
+  // Half axes of 20 and 10 px about (300, 150), with a line of 1 px and its rim.
+  EXPECT_NEAR(box.x, 280, 3);
+  EXPECT_NEAR(box.x + box.width - 1, 320, 3);
+  EXPECT_NEAR(box.y, 140, 3);
+  EXPECT_NEAR(box.y + box.height - 1, 160, 3);
+  EXPECT_GT(at(with, 320, 150)[1], 200) << "white";
+  report.covariances.uu.pop_back();
+  EXPECT_THROW(draw(plainImage(), report), DataError);
+}
+
 TEST(DrawProjection, ShowsMaskedPointsAsGreyDots) {
   CameraFusionReport report;
   addPoint(&report, 100, 50, PointStatus::kOutsideImages);

@@ -607,6 +607,51 @@ TEST(SemanticCloudMessage, HasTheDocumentedFieldsAndValues) {
   EXPECT_THROW(semanticCloudMessage(cloud, classes), DataError);
 }
 
+TEST(PixelCloudMessage, HasTheDocumentedFieldsAndValues) {
+  Cloud cloud;
+  cloud.frame_id = "lidar";
+  cloud.stamp = 1600000000123456789;
+  cloud.resize(3);
+  for (std::size_t i = 0; i < 3; ++i) {
+    const auto k = static_cast<float>(i);
+    cloud.x[i] = k, cloud.y[i] = 10 + k, cloud.z[i] = 20 + k, cloud.intensity[i] = 30 + k;
+    cloud.ring[i] = static_cast<std::uint16_t>(40 + i);
+  }
+  const std::vector<std::uint32_t> index = {2, 0};
+  const std::vector<float> u = {1.5f, 2.5f}, v = {3.5f, 4.5f};
+  const std::vector<float> uu = {5, 6}, uv = {-7, 8}, vv = {9, 10};
+  const std::vector<PointStatus> status = {PointStatus::kFused, PointStatus::kOccluded};
+  const CloudPixels pixels{index, u, v, uu, uv, vv, status};
+  const auto message = pixelCloudMessage(cloud, pixels);
+  EXPECT_EQ(message->header.frame_id, "lidar");
+  EXPECT_EQ(stampNs(message->header.stamp), cloud.stamp);
+  ASSERT_EQ(message->width, 2u);
+  std::vector<std::string> names;
+  for (const auto& field : message->fields) {
+    names.push_back(field.name);
+    const std::size_t size = field.name == "ring" ? 2 : field.name == "status" ? 1 : 4;
+    EXPECT_EQ(field.offset % size, 0u) << field.name;
+  }
+  EXPECT_EQ(names, (std::vector<std::string>{"x", "y", "z", "intensity", "ring", "u", "v", "cov_uu",
+                                             "cov_uv", "cov_vv", "status"}));
+  EXPECT_EQ(message->point_step % 4, 0u);
+  const auto value = [&](std::size_t point, std::size_t field) {
+    float result;
+    std::memcpy(&result,
+                &message->data[point * message->point_step + message->fields[field].offset], 4);
+    return result;
+  };
+  EXPECT_EQ(value(0, 1), 12.0f);
+  EXPECT_EQ(value(0, 3), 32.0f);
+  EXPECT_EQ(value(1, 5), 2.5f);
+  EXPECT_EQ(value(0, 8), -7.0f);
+  EXPECT_EQ(value(1, 9), 10.0f);
+  EXPECT_EQ(message->data[message->point_step + message->fields[10].offset], 1);
+  std::uint16_t ring;
+  std::memcpy(&ring, &message->data[message->fields[4].offset], 2);
+  EXPECT_EQ(ring, 42);
+}
+
 TEST(Decisions, CarryStamps) {
   const auto reference = scanReferenceMessage(kStamp, kStamp + 5);
   EXPECT_EQ(stampNs(reference.header.stamp), kStamp);
