@@ -209,6 +209,10 @@ def check(parser, options):
     """Leaves with exit code 2 unless the options fit together."""
     if sum(map(bool, (options.bags, options.images, options.board))) != 1:
         parser.error("give IN.bag, --images or --board, one of them")
+    if options.images:
+        for name in ("model", "classes"):
+            if not getattr(options, name):
+                parser.error("--images needs --" + name)
     alone = "images" if options.images else "board"
     if options.images or options.board:
         for name in (
@@ -226,14 +230,9 @@ def check(parser, options):
         ):
             if getattr(options, name):
                 parser.error("--%s and --%s exclude each other" % (alone, name.replace("_", "-")))
-    if options.images:
-        for name in ("model", "classes"):
-            if not getattr(options, name):
-                parser.error("--images needs --" + name)
-    elif options.board:
-        if options.fit_temperature:
-            parser.error("--board and --fit-temperature exclude each other")
-    elif not options.rig and not options.clouds:
+    if options.board and options.fit_temperature:
+        parser.error("--board and --fit-temperature exclude each other")
+    if options.bags and not options.rig and not options.clouds:
         parser.error("give --rig, or --clouds of existing bags")
     for name in ("masks", "registration"):
         if getattr(options, name) and not options.rig:

@@ -230,7 +230,7 @@ CameraErrors readCameraErrors(YamlSection section, const std::string& base_direc
   readDeviations(extrinsics, "deg", 3, 90, deviations.data() + 3);
   readDeviations(extrinsics, "m", 3, 10, deviations.data());
   extrinsics.finish();
-  deviations.tail<3>() *= kPi / 180.0;
+  deviations.tail<3>() *= kRadPerDeg;
   errors.extrinsics.diagonal() = deviations.cwiseAbs2();
   std::string runs;
   const std::size_t before = problems->size();

@@ -6,8 +6,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kRadPerDeg = kPi / 180.0;
-
 Eigen::Matrix3d crossMatrix(const Eigen::Vector3d& a) {
   Eigen::Matrix3d m;
   m << 0.0, -a.z(), a.y(), a.z(), 0.0, -a.x(), -a.y(), a.x(), 0.0;

@@ -389,12 +389,15 @@ def test_another_order_of_points_is_refused(rig, run_command, tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ((), "give IN.bag or --images"),
+        ((), "give IN.bag, --images or --board"),
         (("a.bag",), "give --rig"),
         (("a.bag", "--rig", "r", "--fit-on", "b.bag"), "--fit-on needs"),
         (("a.bag", "--clouds", "x"), "must be NAME=BAG"),
         (("--images", "d", "--model", "m"), "--images needs --classes"),
         (("--images", "d", "--live", "l"), "--images needs --model"),
+        (("--board", "d", "--images", "e"), "one of them"),
+        (("--board", "d", "--live", "l"), "--board and --live exclude each other"),
+        (("--board", "d", "--fit-temperature"), "--board and --fit-temperature exclude"),
     ],
 )
 def test_options_that_do_not_fit_together(run_command, arguments, message):
@@ -523,7 +526,7 @@ def test_labelled_images_become_points_on_their_pixels(tmp_path):
         image_truth.find_images(str(tmp_path), "_other")
 
 
-def board_poses(folder, poses=3):
+def board_poses(folder, poses=8):
     """Poses of a board of 0.6 x 0.8 m before a camera whose calibration errs, as its runs do."""
     import cv2
     from scipy.spatial.transform import Rotation
@@ -531,17 +534,19 @@ def board_poses(folder, poses=3):
     random = np.random.RandomState(4)
     spread = np.array([0.02, 0.02, 0.02, 0.02, 0.02, 0.02])
     # The camera looks along the lidar's x.
-    runs = np.array([-np.pi / 2, 0.0, -np.pi / 2, 0.05, 0.0, -0.2]) + spread * random.randn(40, 6)
+    nominal = np.array([-np.pi / 2, 0.0, -np.pi / 2, 0.05, 0.0, -0.2])
+    runs = nominal + spread * random.randn(40, 6)
     folder.mkdir()
     np.savetxt(folder / "extrinsic_runs.csv", runs, delimiter=",", header="roll,pitch,yaw,x,y,z")
     (folder / "camera_info.yaml").write_text(
         "distortion_model: fisheye\nwidth: 480\nheight: 320\nD: [0.0, 0.0, 0.0, 0.0]\n"
         "K: [300.0, 0.0, 240.0, 0.0, 300.0, 160.0, 0.0, 0.0, 1]\n"
     )
-    really = np.array([-np.pi / 2, 0.0, -np.pi / 2, 0.05, 0.0, -0.2]) + spread * random.randn(6)
-    turn, place = Rotation.from_euler("xyz", really[:3]), really[3:]
     for number in range(poses):
-        centre = np.array([-0.5 + 0.5 * number, 0.05 * number, 2.0 + 0.3 * number])
+        # An error of its own for each pose: that of one calibration may happen to be small.
+        really = nominal + spread * random.randn(6)
+        turn, place = Rotation.from_euler("xyz", really[:3]), really[3:]
+        centre = np.array([-0.5 + number % 3 * 0.5, 0.05 * number, 2.0 + 0.1 * number])
         corners = centre + np.array(
             [[-0.3, -0.4, 0], [0.3, -0.4, 0], [0.3, 0.4, 0], [-0.3, 0.4, 0]]
         )
@@ -572,6 +577,7 @@ def board_poses(folder, poses=3):
             ring=np.zeros(len(xyz), np.uint16),
             on_board=on_board.astype(np.uint8),
             board_corners_camera_m=corners,
+            board_centre_lidar_m=turn.apply(centre) + place,
         )
         cv2.imwrite(str(folder / ("pose%02d.png" % number)), np.zeros((320, 480, 3), np.uint8))
     return folder
@@ -587,12 +593,12 @@ def test_expected_distributions_of_a_board_can_be_believed(run_command, tmp_path
     for points in ("all", "next to edges"):
         pixel, expected = rows[points, "pixel"], rows[points, "expected"]
         assert int(pixel["scored"]) == int(expected["scored"]) > 500
-        # The calibration is off by a pixel error of 6 px: the hard outline is surely wrong there.
-        assert float(expected["NLL"]) < 0.8 * float(pixel["NLL"])
-        assert float(expected["Brier"]) < float(pixel["Brier"])
-    assert float(rows["next to edges", "expected"]["ECE"]) < float(
-        rows["next to edges", "pixel"]["ECE"]
-    )
+        # The calibrations are off by 6 px and more, as their runs say: 0.4 of the NLL remains.
+        least = 0.6 if points == "all" else 0.45
+        assert float(expected["NLL"]) <= least * float(pixel["NLL"])
+        for measure in ("Brier", "ECE"):
+            assert float(expected[measure]) < float(pixel[measure])
+        assert float(expected["accuracy"]) == pytest.approx(float(pixel["accuracy"]), abs=0.001)
     assert "| all" in out and "expected" in out
 
 

@@ -5,7 +5,8 @@ A folder of calibration poses (datasets/acfr_calibration.py, compact form: poseN
 extrinsic_runs.csv) becomes a bag. The board's corners, which the chessboard alone tells, give an
 image of P(board) = 0.999 within its outline and 0.001 outside; the returns from the board, which the
 lidar alone tells, are the truth. Between the two stands the calibration, which errs by the spread of
-its runs. Points behind the board, as the camera sees it, have no truth.
+its runs. Points that the board hides from the camera have no truth; the lidar's own place of the board
+tells which, for the outline in the image would leave out what the calibration gets wrong.
 """
 
 import os
@@ -39,6 +40,8 @@ _CLASSES = {
     "evaluation": {"discard": [], "merge": {"other": ["other"], "board": ["board"]}},
 }
 TRANSFERS = ("pixel", "expected")
+_POINT_FIELDS = ("x", "y", "z", "intensity", "ring")
+_FIELDS = _POINT_FIELDS + ("on_board", "board_corners_camera_m", "board_centre_lidar_m")
 
 
 class Pose(NamedTuple):
@@ -125,8 +128,10 @@ def write_bag(folder: str, bag: str, rig: str) -> Dict[int, bool]:
             message = _probabilities(inside)
             message.header = info.header
             bag_writer.write("/camera/probabilities", message, image.stamp_ns)
-            known = ("x", "y", "z", "intensity", "ring")
-            for topic, names in (("/points", known), ("/points_truth", pose.points.dtype.names)):
+            for topic, names in (
+                ("/points", _POINT_FIELDS),
+                ("/points_truth", pose.points.dtype.names),
+            ):
                 cloud = np.zeros(
                     len(pose.points),
                     dtype=cloud_io.point_dtype([(n, _kind(pose.points, n)) for n in names]),
@@ -167,9 +172,7 @@ def _fields(path: str) -> Dict[str, np.ndarray]:
             fields = {name: file[name] for name in file.files}
     except (OSError, ValueError) as error:
         raise DataError("%s: not a readable .npz file (%s)" % (path, error)) from error
-    missing = {"x", "y", "z", "intensity", "ring", "on_board", "board_corners_camera_m"} - set(
-        fields
-    )
+    missing = set(_FIELDS) - set(fields)
     if missing:
         raise DataError("%s: no field %s" % (path, ", ".join(sorted(missing))))
     return fields
@@ -202,7 +205,9 @@ def _pose(
     corners = fields["board_corners_camera_m"].astype(np.float64)
     normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
     normal /= np.linalg.norm(normal)
-    label = np.where(_behind(seen, corners, normal), NO_LABEL, on_board).astype(np.uint8)
+    centre = poses.transform_points(t_camera_lidar, fields["board_centre_lidar_m"][None])[0]
+    behind = _behind(seen, corners + (centre - corners.mean(axis=0)), normal)
+    label = np.where(behind, NO_LABEL, on_board).astype(np.uint8)
 
     grey = inside.astype(np.uint8)
     distance = cv2.distanceTransform(1 - grey, cv2.DIST_L2, 5)
