@@ -26,10 +26,14 @@ template <typename Value>
   refuse(sourceOf(info), field, value, rule);
 }
 
-void requirePositive(const CameraInfo& info, const std::string& field, double value) {
-  if (!(std::isfinite(value) && value > 0.0)) {
+/// The focal length of the image after binning, px.
+double checkedFocalLength(const CameraInfo& info, const std::string& field, double value,
+                          int binning) {
+  // The quotient of the smallest numbers is 0.
+  if (!(std::isfinite(value) && value / binning > 0.0)) {
     refuse(info, field, value, "must be a finite number above 0 (0 = not calibrated)");
   }
+  return value / binning;
 }
 
 void requireFinite(const CameraInfo& info, const std::string& field, double value) {
@@ -188,29 +192,25 @@ CameraModel::CameraModel(const CameraInfo& given, const CameraModelOptions& opti
   const double max_theta_rad = max_theta_deg > 0.0 ? max_theta_deg * kPi / 180.0 : kPi;
 
   if (rectified_) {
-    requirePositive(info, "P[0]", info.p[0]);
-    requirePositive(info, "P[5]", info.p[5]);
+    fx_ = checkedFocalLength(info, "P[0]", info.p[0], reduction.binning_x);
+    fy_ = checkedFocalLength(info, "P[5]", info.p[5], reduction.binning_y);
     for (const std::size_t i : {2, 3, 6, 7}) {
       requireFinite(info, "P[" + std::to_string(i) + "]", info.p[i]);
     }
-    fx_ = info.p[0] / reduction.binning_x;
-    fy_ = info.p[5] / reduction.binning_y;
     cx_ = (info.p[2] - info.roi_x) / reduction.binning_x;
     cy_ = (info.p[6] - info.roi_y) / reduction.binning_y;
     optical_centre_ = {-info.p[3] / info.p[0], -info.p[7] / info.p[5], 0.0};
     const LensParameters plain{sourceOf(info), "pinhole", {}};
     lens_ = kindNamed(plain, lenses).make(plain, max_theta_rad, &notes_);
   } else {
-    requirePositive(info, "K[0]", info.k[0]);
-    requirePositive(info, "K[4]", info.k[4]);
+    fx_ = checkedFocalLength(info, "K[0]", info.k[0], reduction.binning_x);
+    fy_ = checkedFocalLength(info, "K[4]", info.k[4], reduction.binning_y);
     for (const std::size_t i : {1, 2, 5}) {
       requireFinite(info, "K[" + std::to_string(i) + "]", info.k[i]);
     }
     const LensParameters parameters{sourceOf(info), kind.name, info.d};
     lens_ = kind.make(options.lens ? options.lens->lens : parameters, max_theta_rad, &notes_);
     R_raw_camera_ = checkedRotation(info).transpose();
-    fx_ = info.k[0] / reduction.binning_x;
-    fy_ = info.k[4] / reduction.binning_y;
     cx_ = (info.k[2] - info.roi_x) / reduction.binning_x;
     cy_ = (info.k[5] - info.roi_y) / reduction.binning_y;
     if (kind.skewed) skew_ = info.k[1] / info.k[0];

@@ -46,7 +46,8 @@ check_install_space() {
     [ "$description" = "$share/nodelets/nodelet_plugins.xml" ] && [ -f "$description" ] ||
       fail "the plugin description is not exported: '$description'"
     while read -r library; do
-      [ -f "$space/$library.so" ] || fail "the plugin description names $library, which is absent"
+      # A name without a folder: where libraries lie differs between catkin and Debian.
+      [ -f "$lib/$library.so" ] || fail "the plugin description names $library, which is absent"
     done < <(sed -n 's/.*<library path="\([^"]*\)".*/\1/p' "$description")
   fi
   if [ -f "$SLF_SOURCE_DIR/scripts/$package/__init__.py" ]; then

@@ -527,6 +527,12 @@ TEST(CameraModel, ARejectedInfoNamesFieldValueAndRule) {
       {"zero K", [](Info i, Options) { i->k.fill(0.0); }, {"K[0]", "= 0", "above 0"}},
       {"negative fy", [](Info i, Options) { i->k[4] = -5.0; }, {"K[4]", "-5", "above 0"}},
       {"NaN fx", [nan](Info i, Options) { i->k[0] = nan; }, {"K[0]", "nan", "above 0"}},
+      {"fx that binning makes 0",
+       [](Info i, Options) {
+         i->k[0] = 5e-324;
+         i->binning_x = 2;
+       },
+       {"K[0]", "above 0"}},
       {"NaN cx", [nan](Info i, Options) { i->k[2] = nan; }, {"K[2]", "nan", "finite"}},
       {"infinite skew",
        [](Info i, Options) { i->k[1] = std::numeric_limits<double>::infinity(); },
