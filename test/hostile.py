@@ -24,7 +24,7 @@ import live  # noqa: E402
 from bag_factory import Drive, read_cloud  # noqa: E402
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
-from soak import Process, counters  # noqa: E402
+from soak import Process, counters, tell  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 SCANS = 3
@@ -261,11 +261,7 @@ def main():
     parser.add_argument("--minutes", type=float, required=True)
     options = parser.parse_args(rospy.myargv()[1:])
     rospy.init_node("hostile", disable_signals=True)
-    figures = judge(*run(options.minutes))
-    print()
-    for what, measured, limit, holds in figures:
-        print("%-4s %-18s %s (limit: %s)" % ("ok" if holds else "BAD", what, measured, limit))
-    return 0 if all(figure[3] for figure in figures) else 1
+    return tell(judge(*run(options.minutes)))
 
 
 if __name__ == "__main__":

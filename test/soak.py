@@ -211,14 +211,18 @@ def judge(options, samples, final, latency, window, same):
     return figures
 
 
-def main():
-    options = make_parser().parse_args(rospy.myargv()[1:])
-    rospy.init_node("soak", disable_signals=True)
-    figures = judge(options, *watch(options))
+def tell(figures):
+    """Prints (what, measured, limit, holds) of each figure; returns the exit code."""
     print()
     for what, measured, limit, holds in figures:
         print("%-4s %-18s %s (limit: %s)" % ("ok" if holds else "BAD", what, measured, limit))
     return 0 if all(figure[3] for figure in figures) else 1
+
+
+def main():
+    options = make_parser().parse_args(rospy.myargv()[1:])
+    rospy.init_node("soak", disable_signals=True)
+    return tell(judge(options, *watch(options)))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ constexpr int kAzimuths = 720;
 /// Beyond it the place of the lidar in the vehicle does not matter.
 constexpr double kFarthest_m = 10000.0;
 constexpr double kMarginOfHeight = 0.01;
-constexpr double kTurn_rad = 6.28318530717958647692;
 
 }  // namespace
 
@@ -34,7 +33,7 @@ RowBand reachedRows(const CameraModel& camera, const Transform& T_camera_lidar,
     const double elevation =
         reach.lowest_rad + (reach.highest_rad - reach.lowest_rad) * i / kElevations;
     for (int k = 0; k < kAzimuths; ++k) {
-      const double azimuth = kTurn_rad * k / kAzimuths;
+      const double azimuth = 2.0 * kPi * k / kAzimuths;
       const Eigen::Vector3d beam(std::cos(elevation) * std::cos(azimuth),
                                  std::cos(elevation) * std::sin(azimuth), std::sin(elevation));
       for (double range = reach.nearest_m; range < kFarthest_m; range *= 1.5) {

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "motion_kernels.h"
+#include "semantic_lidar_fusion/common/cross_matrix.h"
 
 namespace semantic_lidar_fusion {
 namespace {
@@ -37,19 +38,13 @@ Transform relative(const Transform& T_fixed_a, const Transform& T_fixed_b) {
   return T_a_b;
 }
 
-Eigen::Matrix3d skew(const Eigen::Vector3d& v) {
-  Eigen::Matrix3d matrix;
-  matrix << 0.0, -v.z(), v.y(), v.z(), 0.0, -v.x(), -v.y(), v.x(), 0.0;
-  return matrix;
-}
-
 /// Motion `step` (T_first_second) continued at constant twist to `fraction` times its duration: the
 /// screw motion exp(fraction * log(step)).
 Transform screw(const Transform& step, double fraction) {
   const Eigen::AngleAxisd rotation(step.linear());
   const double angle = rotation.angle();
   // V(phi) = I + b [axis]x + c [axis]x^2 maps the twist's linear part to the translation.
-  const Eigen::Matrix3d axis = skew(rotation.axis());
+  const Eigen::Matrix3d axis = crossMatrix(rotation.axis());
   const auto integral = [&](double phi) -> Eigen::Matrix3d {
     const double b = std::abs(phi) < 1e-9 ? phi / 2.0 : (1.0 - std::cos(phi)) / phi;
     const double c = std::abs(phi) < 1e-9 ? phi * phi / 6.0 : 1.0 - std::sin(phi) / phi;

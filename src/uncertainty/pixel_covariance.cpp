@@ -7,6 +7,7 @@
 #include <cmath>
 
 #include "covariance_kernels.h"
+#include "semantic_lidar_fusion/common/cross_matrix.h"
 #include "semantic_lidar_fusion/projection/rolling_shutter.h"
 
 namespace semantic_lidar_fusion {
@@ -20,13 +21,10 @@ const CovarianceKernels& kernels() {
 /// `motions` in the axes and about the centre of the image, as the upper triangle.
 void toImageAxes(const Matrix6d& motions, const CameraModel& camera, float* out) {
   const Eigen::Matrix3d& R = camera.R_raw_camera();
-  const Eigen::Vector3d& c = camera.opticalCentre();
-  Eigen::Matrix3d turned_centre;
-  turned_centre << 0.0, -c.z(), c.y(), c.z(), 0.0, -c.x(), -c.y(), c.x(), 0.0;
   // A point R (p - c) moves by R (along + around x p).
   Matrix6d to_image = Matrix6d::Zero();
   to_image.topLeftCorner<3, 3>() = to_image.bottomRightCorner<3, 3>() = R;
-  to_image.topRightCorner<3, 3>() = -R * turned_centre;
+  to_image.topRightCorner<3, 3>() = -R * crossMatrix(camera.opticalCentre());
   const Matrix6d moved = to_image * motions * to_image.transpose();
   for (int row = 0, k = 0; row < 6; ++row) {
     for (int column = row; column < 6; ++column) out[k++] = static_cast<float>(moved(row, column));

@@ -3,14 +3,10 @@
 
 #include <cmath>
 
+#include "semantic_lidar_fusion/common/cross_matrix.h"
+
 namespace semantic_lidar_fusion {
 namespace {
-
-Eigen::Matrix3d crossMatrix(const Eigen::Vector3d& a) {
-  Eigen::Matrix3d m;
-  m << 0.0, -a.z(), a.y(), a.z(), 0.0, -a.x(), -a.y(), a.x(), 0.0;
-  return m;
-}
 
 /// What a small motion of frame b is in the axes of frame a.
 Matrix6d adjoint(const Transform& T_a_b) {
