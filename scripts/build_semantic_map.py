@@ -161,9 +161,11 @@ def make_parser():
         help="processes here, for parts of the drives and then for formats (default: 1)",
     )
     work.add_argument(
-        "--scheduler", metavar="ADDRESS", help="an existing Dask cluster, whose workers reach the "
-        "bags under the same paths",
-    )  # fmt: skip
+        "--scheduler",
+        metavar="ADDRESS",
+        type=cli.address,
+        help="an existing Dask cluster, whose workers reach the bags under the same paths",
+    )
     work.add_argument(
         "--memory",
         metavar="MB",
@@ -207,8 +209,6 @@ def check(parser, options):
     kept = [path for path in options.inputs if path.endswith(".submaps")]
     if (options.scan_labels or options.submaps) and not bags:
         parser.error("--scan-labels and --submaps need bags")
-    if options.scheduler is not None and not options.scheduler.strip():
-        parser.error("--scheduler: must be an address, such as tcp://10.0.0.5:8786")
     if options.live and (options.tf or options.poses or options.workers > 1 or options.scheduler):
         parser.error("--live excludes --tf, --poses, --workers and --scheduler")
     if options.duration is not None and not options.live:

@@ -176,6 +176,7 @@ def make_parser():
     parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",
+        type=cli.address,
         help="share them on an existing Dask cluster instead, whose workers reach the files and --out "
         "under the same names, such as tcp://10.0.0.5:8786",
     )

@@ -154,6 +154,13 @@ def positive(text: str) -> int:
     return value
 
 
+def address(text: str) -> str:
+    """The type of an argument that is the address of a Dask scheduler, for argparse."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("must be an address, such as tcp://10.0.0.5:8786")
+    return text
+
+
 def require(*modules: str) -> None:
     """Imports modules; raises MissingDependencyError in one line that names the interpreter."""
     for module in modules:

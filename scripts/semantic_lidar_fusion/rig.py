@@ -91,7 +91,7 @@ class Rig:
         result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         if result.returncode != 0:
             said = result.stderr.decode("utf-8", "replace").split("\nTry: ")[0]
-            raise ConfigError(" ".join(said.split()).replace("fuse_bag: ", "", 1) or path)
+            raise ConfigError(" ".join(said.split()).replace("fuse_bag: error: ", "", 1) or path)
         return Rig(parse_yaml(result.stdout, path), path)
 
     @staticmethod

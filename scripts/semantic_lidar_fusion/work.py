@@ -12,6 +12,8 @@ from semantic_lidar_fusion.errors import DataError
 
 # What does not answer for so long is lost (s).
 DASK_PATIENCE_S = 5.0
+# Between two questions whether it is there (s).
+_DASK_PERIOD_S = 0.5
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -41,9 +43,10 @@ def _in_order(
     limit: int,
     submit: Callable[[Item], Any],
     wait: Callable[[Any], Result],
+    cancel: Callable[[Any], Any],
 ) -> Iterator[Result]:
     """Results in the order of the items, with at most `limit` on their way: finished ones hold
-    memory."""
+    memory. What is on its way at an early end is cancelled."""
     remaining: Deque[Item] = collections.deque(items)
     flying: Deque[Any] = collections.deque()
     try:
@@ -54,7 +57,7 @@ def _in_order(
             flying.popleft()
     finally:
         for future in flying:
-            future.cancel()
+            cancel(future)
 
 
 def _process_results(
@@ -67,6 +70,7 @@ def _process_results(
                 2 * workers,
                 lambda item: pool.submit(compute, item),
                 lambda future: future.result(),
+                lambda future: future.cancel(),
             )
         except futures.process.BrokenProcessPool as error:
             raise DataError("a worker process died (out of memory?)") from error
@@ -80,25 +84,26 @@ def _dask_results(
 
     import distributed
 
-    # Its own complaints, a page each, come before the line that says what it means.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
-    logging.getLogger("tornado").setLevel(logging.CRITICAL + 1)
+    # Their own complaints, a page each, come before the line that says what it means.
+    for name in ("distributed", "distributed.client", "tornado", "tornado.application", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
-        client = distributed.Client(scheduler, timeout=DASK_PATIENCE_S)
+        # As the default client it would be closed again, and waited for, when Python ends.
+        client = distributed.Client(scheduler, timeout=DASK_PATIENCE_S, set_as_default=False)
     except Exception as error:  # whatever an address may be wrong in
         raise DataError("no Dask scheduler at %s (%s)" % (scheduler, error)) from error
     try:
-        workers = _dask_workers(client)
-        if not workers:
-            try:
-                client.wait_for_workers(1, timeout=DASK_PATIENCE_S)
-            except Exception as error:
-                raise DataError("the Dask scheduler at %s has no workers" % scheduler) from error
+        try:
+            client.wait_for_workers(1, timeout=DASK_PATIENCE_S)
+            workers = _dask_workers(client)
+        except Exception as error:
+            raise DataError("the Dask scheduler at %s has no workers" % scheduler) from error
         yield from _in_order(
             items,
             2 * max(1, workers),
             lambda item: client.submit(compute, item, pure=False),
             lambda future: _dask_wait(client, future, scheduler),
+            lambda future: None,  # the scheduler forgets what it does for a client that leaves
         )
     finally:
         try:
@@ -108,7 +113,9 @@ def _dask_results(
 
 
 def _dask_workers(client: Any) -> int:
-    return len(client.scheduler_info().get("workers", {}))
+    """The number of workers; raises where the scheduler does not answer in time."""
+    answer = client.sync(client.scheduler.identity, callback_timeout=DASK_PATIENCE_S)
+    return len(answer["workers"])
 
 
 def _dask_wait(client: Any, future: Any, scheduler: str) -> Any:
@@ -116,17 +123,23 @@ def _dask_wait(client: Any, future: Any, scheduler: str) -> Any:
     from distributed.comm import CommClosedError
     from distributed.scheduler import KilledWorker
 
-    good_at = time.monotonic()
+    good_at = asked_at = time.monotonic()
     while not future.done():
         time.sleep(0.02)
-        alive = client.status == "running"
-        if alive and _dask_workers(client):
-            good_at = time.monotonic()
-        elif time.monotonic() - good_at > DASK_PATIENCE_S:
-            what = (
-                "all workers of the Dask scheduler at %s" if alive else "the Dask scheduler at %s"
+        if time.monotonic() - asked_at < _DASK_PERIOD_S:
+            continue
+        try:
+            workers, lost = (
+                _dask_workers(client),
+                "all workers of the Dask scheduler at %s are gone",
             )
-            raise DataError((what + " are gone" if alive else what + " is gone") % scheduler)
+        except Exception:  # whatever a connection may die of
+            workers, lost = 0, "the Dask scheduler at %s is gone"
+        asked_at = time.monotonic()
+        if workers:
+            good_at = asked_at
+        elif asked_at - good_at > DASK_PATIENCE_S:
+            raise DataError(lost % scheduler)
     try:
         return future.result(timeout=DASK_PATIENCE_S)
     except ImportError as error:

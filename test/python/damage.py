@@ -234,7 +234,7 @@ def faults(outcome: Outcome) -> List[str]:
         found.append("ended by signal %d" % -outcome.code)
     elif outcome.code not in (0, 1):
         found.append("exit code %d" % outcome.code)
-    if "Traceback" in outcome.errors or "unexpected" in outcome.errors:
+    if "Traceback" in outcome.errors or "error: unexpected " in outcome.errors:
         found.append("a trace")
     if outcome.most_bytes > MOST_BYTES:
         found.append("%.1f GB" % (outcome.most_bytes * 1e-9))

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -160,6 +161,49 @@ def test_a_scheduler_that_is_not_there_is_said(monkeypatch):
     nowhere = work.Work(scheduler="tcp://127.0.0.1:1")
     with pytest.raises(DataError, match="no Dask scheduler at tcp://127.0.0.1:1"):
         next(work.in_order([], build.compute_part, nowhere))
+
+
+ENOUGH = threading.Event()
+
+
+def slow(started):
+    """Work that lasts until ENOUGH, in the process of the test."""
+    with open(started, "w"):
+        ENOUGH.wait(60.0)
+
+
+@pytest.mark.parametrize("lost", ["no workers", "the workers", "the scheduler"])
+def test_what_a_dask_cluster_loses_is_said(monkeypatch, tmp_path, lost):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(work, "DASK_PATIENCE_S", 1.0)
+    monkeypatch.setattr(work, "_DASK_PERIOD_S", 0.05)
+    reason = {
+        "no workers": "the Dask scheduler at %s has no workers",
+        "the workers": "all workers of the Dask scheduler at %s are gone",
+        "the scheduler": "the Dask scheduler at %s is gone",
+    }[lost]
+    ENOUGH.clear()
+    started = tmp_path / "started"
+    count = 0 if lost == "no workers" else 1
+    with distributed.LocalCluster(
+        n_workers=count, processes=False, dashboard_address=None
+    ) as cluster:
+        counted = work._dask_workers
+
+        def losing(client):
+            if started.exists() and lost == "the workers":
+                cluster.scale(0)
+            if started.exists() and lost == "the scheduler":
+                raise OSError("Timed out")  # as where it does not answer
+            return counted(client)
+
+        monkeypatch.setattr(work, "_dask_workers", losing)
+        at = cluster.scheduler_address
+        try:
+            with pytest.raises(DataError, match=reason % at):
+                list(work.in_order([str(started)], slow, work.Work(scheduler=at)))
+        finally:
+            ENOUGH.set()
 
 
 def add_part(accumulator, result):
