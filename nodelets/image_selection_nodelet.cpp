@@ -13,6 +13,7 @@
 #include "edge/lidar_decoder.h"
 #include "edge/tf_subscription.h"
 #include "edge/topics.h"
+#include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
@@ -43,7 +44,7 @@ class ImageSelectionNodelet : public FusionNodelet {
     explicit Camera(const CameraConfig& config) : config(config), geometry(config) {}
 
     const CameraConfig& config;
-    CameraGeometry geometry;  ///< for closest_to_sweep
+    CameraGeometry geometry;
     StampedStore<Image> images{kMaxImages};
     StampedStore<bool> semantics{kKnownStamps};  ///< free-running network: stamps with scores
     StampedStore<bool> sent{kKnownStamps};       ///< images that are published
@@ -66,6 +67,7 @@ class ImageSelectionNodelet : public FusionNodelet {
           getNodeHandle(), cameraTopic(config, "selection"), 16);
       camera.image_selected =
           advertise<sensor_msgs::Image>(getNodeHandle(), cameraTopic(config, "image_selected"), 4);
+      subscribeInfo(&camera);
     }
     followTuning();
     startTicking();
@@ -88,7 +90,6 @@ class ImageSelectionNodelet : public FusionNodelet {
       for (const auto& camera : cameras_) {
         unsubscribe(&camera->images_subscriber);
         unsubscribe(&camera->semantics_subscriber);
-        unsubscribe(&camera->info_subscriber);
       }
       return;
     }
@@ -122,12 +123,21 @@ class ImageSelectionNodelet : public FusionNodelet {
           getNodeHandle(), semanticsTopic(rig(), config), 32,
           [this, index](const sensor_msgs::ImageConstPtr& scores) { onSemantics(index, *scores); });
     }
-    if (sweep_) {
-      camera.info_subscriber = subscribe<sensor_msgs::CameraInfo>(
-          getNodeHandle(), inputTopic(config, config.camera_info), 8,
-          [&camera](const sensor_msgs::CameraInfoConstPtr& info) { camera.geometry.update(*info); },
-          Health::Expect::kOnce);
-    }
+  }
+
+  /// Read from the start: it may be latched, or come only once. The projection tells what is wrong
+  /// with it, or that it is missing.
+  void subscribeInfo(Camera* camera) {
+    camera->info_subscriber = subscribe<sensor_msgs::CameraInfo>(
+        getNodeHandle(), inputTopic(camera->config, camera->config.camera_info), 8,
+        [camera](const sensor_msgs::CameraInfoConstPtr& info) {
+          try {
+            camera->geometry.update(*info);
+          } catch (const DataError&) {
+          }
+        },
+        Health::Expect::kOnce);
+    health().retireInput(camera->info_subscriber.getTopic());
   }
 
   /// A free-running network of another node: its scores come whether or not an image is chosen.
@@ -292,16 +302,21 @@ class ImageSelectionNodelet : public FusionNodelet {
       return;
     }
     camera.sent.put(*decision.image_stamp, true);
-    guard(imageTopic(camera.config), [&] {
-      if (image->raw) {
-        camera.image_selected.publish(image->raw);
-        health().published(camera.image_selected.getTopic());
-      } else {
-        const StageTimer timer(health(), "decompression");
-        publish(camera.image_selected,
-                imageMessage(decodedImage(*image->compressed), image->compressed->header));
-      }
-    });
+    guard(imageTopic(camera.config), [&] { publishImage(camera, *image); });
+  }
+
+  void publishImage(const Camera& camera, const Image& image) {
+    std::optional<ImageSize> wanted;
+    if (camera.geometry.model()) wanted = camera.geometry.model()->imageSize();
+    if (image.raw) {
+      checkImageSize(imageSize(*image.raw), wanted);
+      camera.image_selected.publish(image.raw);
+      health().published(camera.image_selected.getTopic());
+    } else {
+      const StageTimer timer(health(), "decompression");
+      publish(camera.image_selected,
+              imageMessage(decodedImage(*image.compressed, wanted), image.compressed->header));
+    }
   }
 
   std::unique_ptr<ScanSelector> selector_;

@@ -260,7 +260,19 @@ cv::Mat colorImage(const sensor_msgs::ImageConstPtr& message) {
   }
 }
 
-cv::Mat decodedImage(const sensor_msgs::CompressedImage& message) {
+ImageSize imageSize(const sensor_msgs::Image& message) {
+  constexpr std::uint32_t kMost = 1u << 30;
+  return {static_cast<int>(std::min(message.width, kMost)),
+          static_cast<int>(std::min(message.height, kMost))};
+}
+
+void checkImageSize(const ImageSize& size, const std::optional<ImageSize>& wanted) {
+  if (!wanted || size == *wanted) return;
+  throw DataError("is " + sizeText(size) + "; camera_info says " + sizeText(*wanted));
+}
+
+cv::Mat decodedImage(const sensor_msgs::CompressedImage& message,
+                     const std::optional<ImageSize>& wanted) {
   if (message.data.empty()) throw DataError("compressed image is empty");
   if (jpegIsCutOff(message.data)) {
     throw DataError("compressed image of format '" + message.format + "', " +
@@ -272,6 +284,7 @@ cv::Mat decodedImage(const sensor_msgs::CompressedImage& message) {
                     std::to_string(message.data.size()) +
                     " bytes, cannot be decoded: JPEG, PNG, BMP, TIFF and WebP are");
   }
+  checkImageSize(*size, wanted);
   if (std::int64_t{size->width} * size->height > kMostPixels) {
     throw DataError("compressed image of format '" + message.format + "' is " +
                     std::to_string(size->width) + " x " + std::to_string(size->height) +

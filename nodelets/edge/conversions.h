@@ -48,8 +48,14 @@ cv::Mat pixelView(const sensor_msgs::Image& message);
 /// Shares the message's pixels where they have that form already: see pixelView.
 cv::Mat colorImage(const sensor_msgs::ImageConstPtr& message);
 /// JPEG, PNG, BMP, TIFF or WebP of at most kMostPixels pixels: CV_8UC1 or CV_8UC3 in BGR order.
-/// EXIF rotation is ignored: the pixels are those of camera_info.
-cv::Mat decodedImage(const sensor_msgs::CompressedImage& message);
+/// EXIF rotation is ignored: the pixels are those of camera_info, whose size, where it is known, is
+/// compared with the header's before anything is decoded.
+cv::Mat decodedImage(const sensor_msgs::CompressedImage& message,
+                     const std::optional<ImageSize>& wanted = std::nullopt);
+/// At most 2^30 a side.
+ImageSize imageSize(const sensor_msgs::Image& message);
+/// Throws DataError where an image has another size than camera_info says, if that is known.
+void checkImageSize(const ImageSize& size, const std::optional<ImageSize>& wanted);
 /// Encoding after the type: mono8, bgr8, else e.g. 32SC1 or 32FC12.
 sensor_msgs::ImagePtr imageMessage(const cv::Mat& pixels, const std_msgs::Header& header);
 

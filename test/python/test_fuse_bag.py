@@ -196,6 +196,24 @@ def test_wrong_transport_is_told(room, tmp_path):
     assert "transport: raw" in result.stderr
 
 
+@pytest.mark.parametrize("transport", ["raw", "compressed"])
+def test_images_of_another_size_than_camera_info_are_told(tmp_path, transport):
+    made = Made(tmp_path, Drive(scans=1, image_transport=transport))
+    size = made.drive.cameras[1].width, made.drive.cameras[1].height
+
+    def change(topic, message):
+        if topic == "/left/camera_info":
+            message.width *= 2
+
+    rewritten(made.bag, tmp_path / "wide.bag", change)
+    result = run(tmp_path / "wide.bag", tmp_path / "out.bag", "--rig", made.rig)
+    assert result.returncode == 0, result.stderr
+    sizes = size + (2 * size[0], size[1])
+    assert "is %dx%d; camera_info says %dx%d" % sizes in result.stderr
+    cloud = Fused(tmp_path / "out.bag", result).clouds()[0]
+    assert set(cloud["cameras"][cloud["status"] == 0]) == {1}
+
+
 def test_odometry_topic_gives_the_same_as_tf(tmp_path, fused):
     made = Made(tmp_path, Drive(odometry="topic"))
     for ours, theirs in zip(made.fuse().clouds(), fused.clouds()):

@@ -459,6 +459,13 @@ UP = os.pardir
 NAN = np.full((8, 4), np.nan, dtype="<f4").tobytes()
 T0, T1, T2 = made.stamps([100]), made.stamps([200]), made.stamps([300])
 BAD = [
+    (
+        "kitti",
+        replace(
+            ["oxts", "timestamps.txt"], made.stamps([100, 200, 300, 400]).replace("2011", "6011")
+        ),
+        "timestamps.txt line 1: its time lies outside 1970 to 2106",
+    ),
     ("kitti", remove(UP, "calib_cam_to_cam.txt"), "calib_cam_to_cam.txt: no such file"),
     ("kitti", remove(UP, "calib_velo_to_cam.txt"), "calib_velo_to_cam.txt: no such file"),
     ("kitti", remove(UP, "calib_imu_to_velo.txt"), "calib_imu_to_velo.txt: no such file"),
@@ -634,6 +641,15 @@ def test_one_line_errors_and_nothing_half_written(run_command, tmp_path, dataset
     assert code == 1, err
     assert err.count("\n") == 1 and "error: " in err and text in err, err
     assert os.listdir(str(out)) == []
+
+
+def test_names_that_tell_no_ros_time(run_command, tmp_path):
+    folder = made.rellis(tmp_path)
+    images = os.path.join(folder, "pylon_camera_node")
+    first = os.path.join(images, sorted(os.listdir(images))[0])
+    os.rename(first, os.path.join(images, "frame000000-%s_000.jpg" % ("9" * 30)))
+    code, _, err = run_command(SCRIPT, "rellis", folder, tmp_path / "a.bag")
+    assert code == 1 and err.count("\n") == 1 and "outside 1970 to 2106" in err, err
 
 
 def test_bad_line_of_a_text_scan(run_command, tmp_path):

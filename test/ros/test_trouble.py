@@ -234,6 +234,20 @@ class Trouble(unittest.TestCase):
         self.said.wait_for(r"odom <- base_link .*1e\+39")
         self.assert_good()
 
+    def test_13_images_of_another_size_than_camera_info_says(self):
+        def change(topic, message):
+            if topic == "/left/image":
+                message.height //= 2
+                message.data = message.data[: message.step * message.height]
+            return message
+
+        for cloud in self.run_drive(change):
+            self.assertEqual(set(cloud["cameras"][cloud["status"] == 0]), {1})
+        left = self.drive.cameras[1]
+        sizes = (left.width, left.height // 2, left.width, left.height)
+        self.said.wait_for("left/image: is %dx%d; camera_info says %dx%d" % sizes, Log.ERROR)
+        self.assert_good()
+
 
 if __name__ == "__main__":
     rospy.init_node("test_trouble")

@@ -13,21 +13,16 @@ namespace {
 /// Images of one camera that are kept after use.
 constexpr std::size_t kRecentImages = 3;
 
-void checkSize(const SegmentedImage& image, const ImageSize& wanted) {
-  if (image.image.empty()) return;
-  if (image.image.cols != wanted.width || image.image.rows != wanted.height) {
-    throw DataError("is " + sizeText({image.image.cols, image.image.rows}) + "; camera_info says " +
-                    sizeText(wanted));
-  }
-}
-
 /// The image with its pixels, from its messages. `owner` keeps what it refers to.
 std::shared_ptr<SegmentedImage> decoded(const ImageTask& task) {
   auto result = std::make_shared<SegmentedImage>();
   result->stamp = task.stamp;
   result->lidar_rows = task.lidar_rows;
-  if (task.file) result->image = decodedImage(*task.file);
-  if (task.pixels) result->image = colorImage(task.pixels);
+  if (task.file) result->image = decodedImage(*task.file, task.size);
+  if (task.pixels) {
+    checkImageSize(imageSize(*task.pixels), task.size);
+    result->image = colorImage(task.pixels);
+  }
   if (task.semantics) result->input = pixelView(*task.semantics);
   using Messages = std::pair<sensor_msgs::ImageConstPtr, sensor_msgs::ImageConstPtr>;
   result->owner = std::make_shared<const Messages>(task.pixels, task.semantics);
@@ -93,7 +88,6 @@ void ImageSource::make(ImageTask* task) {
   if (!task->failure.empty()) return;
   try {
     const std::shared_ptr<SegmentedImage> image = decoded(*task);
-    checkSize(*image, task->size);
     pipeline_.segment(task->camera, image.get());
     if (!keep_pixels_) {
       if (!task->keeps_pixels) image->image.release();

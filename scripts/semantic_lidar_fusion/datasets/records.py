@@ -330,6 +330,13 @@ def rectified_camera(
     return k, t_parent_rect @ np.linalg.inv(t_camera_rect)
 
 
+def check_stamp(stamp_ns: int, where: str) -> int:
+    """The stamp (ns); DataError outside what a ROS time holds."""
+    if not 0 < stamp_ns < 2**32 * 1000000000:
+        raise DataError("%s: its time lies outside 1970 to 2106" % where)
+    return stamp_ns
+
+
 def check_increasing(stamps_ns: Sequence[int], where: str) -> None:
     for index, (a, b) in enumerate(zip(stamps_ns, stamps_ns[1:])):
         if b <= a:

@@ -111,7 +111,7 @@ def frame_stamp(path: str) -> Tuple[int, int]:
     if not match:
         raise DataError("%s: not named frameNNNNNN-SECONDS_MILLIS" % path)
     number, seconds, millis = (int(group) for group in match.groups())
-    return number, seconds * 1000000000 + millis * 1000000
+    return number, records.check_stamp(seconds * 1000000000 + millis * 1000000, path)
 
 
 def read_ply(path: str) -> np.ndarray:

@@ -20,7 +20,8 @@ def parse_time(text: str, where: str) -> int:
         seconds = calendar.timegm(time.strptime(match.group(1), "%Y-%m-%d %H:%M:%S"))
     except ValueError as error:
         raise DataError("%s: %s" % (where, error)) from error
-    return seconds * 1000000000 + int((match.group(2) or "0").ljust(9, "0"))
+    nanoseconds = int((match.group(2) or "0").ljust(9, "0"))
+    return records.check_stamp(seconds * 1000000000 + nanoseconds, where)
 
 
 def read_times(path: str) -> Dict[int, int]:

@@ -313,6 +313,25 @@ TEST(CompressedImage, AHeaderOfAbsurdSizeIsRefusedBeforeAnythingIsDecoded) {
   }
 }
 
+TEST(CompressedImage, TheSizeOfCameraInfoIsComparedBeforeAnythingIsDecoded) {
+  const cv::Mat picture(12, 16, CV_8UC3, cv::Scalar(1, 2, 3));
+  sensor_msgs::CompressedImage message;
+  cv::imencode(".png", picture, message.data);
+  EXPECT_EQ(decodedImage(message, ImageSize{16, 12}).size(), picture.size());
+  message.data.resize(40);  // of the picture itself nothing is left
+  const auto refusal = [&](const std::optional<ImageSize>& wanted) -> std::string {
+    try {
+      decodedImage(message, wanted);
+    } catch (const DataError& error) {
+      return error.what();
+    }
+    return "accepted";
+  };
+  EXPECT_EQ(refusal(ImageSize{12, 16}), "is 16x12; camera_info says 12x16");
+  EXPECT_NE(refusal(ImageSize{16, 12}).find("cannot be decoded"), std::string::npos);
+  EXPECT_NE(refusal(std::nullopt).find("cannot be decoded"), std::string::npos);
+}
+
 TEST(CompressedImage, EveryFormatThatIsDecodedTellsItsSizeFirst) {
   cv::Mat picture(12, 16, CV_8UC3, cv::Scalar(1, 2, 3));
   sensor_msgs::CompressedImage tiff, webp, lossless, portable;
