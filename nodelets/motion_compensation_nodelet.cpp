@@ -198,15 +198,22 @@ class MotionCompensationNodelet : public FusionNodelet {
       const bool complete = gap.empty() && (T_vehicle_lidar || !rig().motion_enabled);
       const StampNs waited_since = std::max(scan.arrived_ns, reference->arrived_ns);
       if (!complete && now() - waited_since < toNs(rig().odometry.timeout_s)) return;
-      if (!complete) {
-        health().problem("odometry timeouts");
-        warn("odometry", "scan without full odometry after " +
-                             std::to_string(rig().odometry.timeout_s) +
-                             " s: " + (T_vehicle_lidar ? gap : T_vehicle_lidar.message));
-      }
+      if (!complete) tellIncomplete(gap, T_vehicle_lidar);
       Scan leaving = std::move(pending_.front());
       pending_.pop_front();  // first: an error must not meet it again
       publishCompensated(std::move(leaving.cloud), t_ref, T_vehicle_lidar.transform);
+    }
+  }
+
+  /// Why a scan leaves without all poses, after the wait for them.
+  void tellIncomplete(const std::string& gap, const TransformAnswer& T_vehicle_lidar) {
+    const std::string after = " after " + std::to_string(rig().odometry.timeout_s) + " s: ";
+    if (T_vehicle_lidar) {
+      health().problem("odometry timeouts");
+      warn("odometry", "scan without full odometry" + after + gap);
+    } else {
+      health().problem("no extrinsics of the lidar");
+      warn("extrinsics", "scan without extrinsics of the lidar" + after + T_vehicle_lidar.advice());
     }
   }
 

@@ -352,9 +352,10 @@ class ProjectionNodelet : public FusionNodelet {
     }
     const TransformAnswer T_camera_lidar =
         tf_->source().extrinsics(camera.geometry.frame(), lidar_frame);
+    health().set(name + ": extrinsics", T_camera_lidar ? "known" : T_camera_lidar.message);
     if (!T_camera_lidar) {
       health().problem(name + ": no extrinsics");
-      warn("extrinsics " + name, name + ": " + T_camera_lidar.message);
+      warn("extrinsics " + name, name + ": " + T_camera_lidar.advice());
       return place;
     }
     place.model = camera.geometry.model();

@@ -82,6 +82,12 @@ std::optional<Transform> poseOf(const std::map<StampNs, Transform>& poses, Stamp
                          static_cast<double>(after->first - before->first));
 }
 
+std::string joined(const std::vector<std::string>& names) {
+  std::string text;
+  for (const std::string& name : names) text += (text.empty() ? "" : ", ") + name;
+  return text;
+}
+
 ros::Duration cacheLength(StampNs history_ns) {
   return ros::Duration(history_ns > 0 ? toSeconds(history_ns) : kEndlessCacheS);
 }
@@ -107,6 +113,12 @@ TfPoseSource::TfPoseSource(TfPoseSourceConfig config)
   config_.fixed_frame = frameName(config_.fixed_frame);
   config_.vehicle_frame = frameName(config_.vehicle_frame);
   asked_ = {config_.fixed_frame, config_.vehicle_frame};
+}
+
+std::string TransformAnswer::advice() const {
+  const bool is_missing =
+      problem == TransformProblem::kUnknownFrame || problem == TransformProblem::kNotConnected;
+  return message + (is_missing ? std::string("; ") + kTransformCure : "");
 }
 
 bool TfPoseSource::refuse(const std::string& child, const std::string& what,
@@ -463,8 +475,9 @@ TransformAnswer TfPoseSource::lookup(const std::string& target, const std::strin
     answer.transform = transform(buffer_->lookupTransform(target, source, time).transform);
     return answer;
   } catch (const tf2::TransformException& e) {
-    const std::string unknown = unknownFrame(target, source);
-    answer.message = target + " <- " + source + ": " + (unknown.empty() ? e.what() : unknown);
+    const std::string missing = whatIsMissing(target, source);
+    answer.message = "no transform from '" + source + "' to '" + target +
+                     "': " + (missing.empty() ? e.what() : missing);
     if (dynamic_cast<const tf2::ExtrapolationException*>(&e)) {
       answer.problem = TransformProblem::kNotCovered;
     } else if (dynamic_cast<const tf2::ConnectivityException*>(&e)) {
@@ -475,28 +488,39 @@ TransformAnswer TfPoseSource::lookup(const std::string& target, const std::strin
       answer.problem = TransformProblem::kInvalidRequest;
     }
   } catch (const DataError& e) {
-    answer.message = target + " <- " + source + ": " + e.what();
+    answer.message = "no transform from '" + source + "' to '" + target + "': " + e.what();
     answer.problem = TransformProblem::kInvalidRequest;
   }
   return answer;
 }
 
-/// Which of two frames no transform has, with a name that was perhaps meant; empty if both exist.
-std::string TfPoseSource::unknownFrame(const std::string& target, const std::string& source) const {
-  constexpr std::size_t kMostCompared = 1000;
+/// Why two frames are not joined: a frame that no transform has, or two trees; empty
+/// if they are joined.
+std::string TfPoseSource::whatIsMissing(const std::string& target,
+                                        const std::string& source) const {
+  constexpr std::size_t kMostCompared = 1000, kMostListed = 12;
   std::set<std::string> known;
   for (const auto& [child, edge] : edges_) {
     known.insert({child, edge.parent});
     if (known.size() > kMostCompared) return {};
   }
+  const std::vector<std::string> names(known.begin(), known.end());
   for (const std::string& frame : {target, source}) {
     if (known.count(frame) > 0) continue;
-    const std::vector<std::string> names(known.begin(), known.end());
+    if (frame.empty()) return "the header.frame_id of its messages is empty";
+    if (names.empty()) return "no transform came at all";
+    const std::string text = "no transform has a frame '" + frame + "'";
     const std::string nearest = nearestName(frame, names);
-    return "no transform has a frame '" + frame + "'" +
-           (nearest.empty() ? "" : "; did you mean '" + nearest + "'?");
+    if (!nearest.empty()) return text + "; did you mean '" + nearest + "'?";
+    const bool all = names.size() <= kMostListed;
+    return text + ", of " +
+           joined({names.begin(), all ? names.end() : names.begin() + kMostListed}) +
+           (all ? "" : ", ...");
   }
-  return {};
+  const std::string top_target = ancestors(target).back(), top_source = ancestors(source).back();
+  if (top_target == top_source) return {};
+  return "one hangs below '" + top_source + "', the other below '" + top_target +
+         "', and nothing joins these";
 }
 
 /// A frame and those above it.

@@ -35,11 +35,18 @@ enum class TransformProblem : std::uint8_t {
   kInvalidRequest  ///< an empty frame name, a broken tree
 };
 
+/// What to do about transforms that are missing.
+constexpr char kTransformCure[] =
+    "publish it (what does not move on /tf_static), or give the bag that holds it, too";
+
 /// A transform, or nothing and why.
 struct TransformAnswer {
   std::optional<Transform> transform;
   TransformProblem problem = TransformProblem::kNone;
   std::string message;  ///< names the frames
+
+  /// The message, and what to do about a transform that is missing.
+  std::string advice() const;
 
   explicit operator bool() const { return transform.has_value(); }
 };
@@ -120,7 +127,7 @@ class TfPoseSource {
                         const Transform& T_parent_child);
   void noteChangingExtrinsics(const std::string& target, const std::string& source) const;
   std::vector<std::string> ancestors(const std::string& frame) const;
-  std::string unknownFrame(const std::string& target, const std::string& source) const;
+  std::string whatIsMissing(const std::string& target, const std::string& source) const;
   std::optional<Transform> poseFromEdges(StampNs stamp) const;
   std::string jumpText(StampNs stamp) const;
   void addReading(const StampedPose& reading);

@@ -7,7 +7,7 @@ import os
 import re
 
 SOURCE_DIR = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-FAILURE_MODES = 80
+FAILURE_MODES = 82
 
 
 def read(path):

@@ -304,6 +304,16 @@ def campaign(
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def summary_text(summary: Summary) -> str:
+    return "%d runs, %d refused in one line, %d faults; longest %.1f s, most memory %.0f MB" % (
+        summary.runs,
+        summary.refused,
+        len(summary.faults),
+        summary.longest_s,
+        summary.most_bytes * 1e-6,
+    )
+
+
 def _import_all() -> None:
     import cv2  # noqa: F401
     import rosbag  # noqa: F401
@@ -328,16 +338,7 @@ def main() -> int:
     parser.add_argument("commands", nargs="*", help="only these (default: all)")
     options = parser.parse_args()
     summary = campaign(options.flips, options.cuts, options.seed, options.commands or None, True)
-    print(
-        "%d runs, %d refused in one line, %d faults; longest %.1f s, most memory %.0f MB"
-        % (
-            summary.runs,
-            summary.refused,
-            len(summary.faults),
-            summary.longest_s,
-            summary.most_bytes * 1e-6,
-        )
-    )
+    print(summary_text(summary))
     return 1 if summary.faults else 0
 
 

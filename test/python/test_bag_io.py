@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Bags: reading by topic and type, velodyne messages without their package, atomic writing."""
 
+import errno
 import io
 import os
 import struct
@@ -227,6 +228,24 @@ def test_an_index_that_leads_to_a_message_of_another_topic_is_damage(tmp_path):
             DataError, match="damaged.*another topic"
         ):
             list(getattr(bag, read)(["/tf"]))
+
+
+@pytest.mark.parametrize(
+    "number, text",
+    [(errno.ENOSPC, "the temporary folder .*No space left.*TMPDIR"), (errno.EIO, "Input/output")],
+)
+def test_a_full_temporary_folder_and_a_failing_disk_are_no_damage(tmp_path, number, text):
+    path = str(tmp_path / "a.bag")
+    with bag_io.BagWriter(path, "none") as writer:
+        writer.write("/text", String("text"), 1)
+
+    def failing():
+        raise OSError(number, os.strerror(number))
+        yield
+
+    with bag_io.BagReader(path) as bag, pytest.raises(DataError, match=text) as refusal:
+        list(bag._guarded(failing()))
+    assert path in str(refusal.value) and "damaged" not in str(refusal.value)
 
 
 def test_whatever_a_damaged_bag_raises_is_a_data_error(tmp_path):

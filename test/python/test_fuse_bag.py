@@ -196,6 +196,41 @@ def test_wrong_transport_is_told(room, tmp_path):
     assert "transport: raw" in result.stderr
 
 
+WITHOUT_TRANSFORM = [
+    # What of /tf_static is missing, frames that messages give another name, and what is said.
+    (("velodyne", "front", "left"), {}, "no transform has a frame 'velodyne', of base_link, odom;"),
+    (("velodyne",), {}, "from 'velodyne' to 'base_link': no transform has a frame 'velodyne'"),
+    (("front", "left"), {}, "from 'velodyne' to 'left': no transform has a frame 'left'"),
+    ((), {"/points": "velodyn"}, "a frame 'velodyn'; did you mean 'velodyne'?"),
+    (
+        (),
+        {"/front/camera_info": "optical", "/left/camera_info": ""},
+        "'optical', of base_link, front",
+    ),
+    ((), {"/front/camera_info": "", "/left/camera_info": ""}, "header.frame_id of its messages is"),
+    ((), {"parent": "body"}, "one hangs below 'odom', the other below 'body'"),
+]
+
+
+@pytest.mark.parametrize("missing, names, text", WITHOUT_TRANSFORM)
+def test_a_missing_transform_is_the_reason(room, tmp_path, missing, names, text):
+    def change(topic, message):
+        if topic in names:
+            message.header.frame_id = names[topic]
+        if topic == "/tf_static":
+            message.transforms = [t for t in message.transforms if t.child_frame_id not in missing]
+            for transform in message.transforms:
+                if transform.child_frame_id != "velodyne":
+                    transform.header.frame_id = names.get("parent", transform.header.frame_id)
+
+    rewritten(room.bag, tmp_path / "in.bag", change)
+    result = run(tmp_path / "in.bag", tmp_path / "out.bag", "--rig", room.rig, "--quiet")
+    assert result.returncode == 1
+    error = result.stderr.splitlines()[-1]
+    assert "error: " in error and text in error and "publish it" in error, error
+    assert "odometry does not cover" not in result.stderr
+
+
 @pytest.mark.parametrize("transport", ["raw", "compressed"])
 def test_images_of_another_size_than_camera_info_are_told(tmp_path, transport):
     made = Made(tmp_path, Drive(scans=1, image_transport=transport))

@@ -330,7 +330,7 @@ std::map<std::string, std::uint64_t> FusionRun::dropsOf(const FusedOutput& outpu
   return drops;
 }
 
-std::string FusionRun::whyNothingIsFused() const {
+std::string FusionRun::whyNothingIsFused() {
   for (const FusedOutput& output : outputs_) {
     const RunReport& report = output.report();
     if (rig_.cameras.empty() || report.fusedPoints() > 0) continue;
@@ -338,6 +338,9 @@ std::string FusionRun::whyNothingIsFused() const {
     for (const auto& drop : dropsOf(output)) {
       text += "; " + drop.first + ": " + std::to_string(drop.second);
     }
+    for (const std::string& reason : places_.missing()) text += "; " + reason;
+    if (rig_.motion_enabled && poses_.odometry().empty()) text += "; " + poses_.gap(0, 0);
+    if (!places_.missing().empty()) text += std::string("; ") + kTransformCure;
     return text + ". " + output.path() + " is written; check_rig.py looks for the cause";
   }
   return {};

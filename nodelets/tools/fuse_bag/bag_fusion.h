@@ -49,7 +49,7 @@ class FusionRun {
   /// What came in, what came out, and what was dropped and why.
   std::string summary() const;
   /// Why no point of some output got a class though the rig has cameras; empty if they did.
-  std::string whyNothingIsFused() const;
+  std::string whyNothingIsFused();
 
  private:
   struct Decided;

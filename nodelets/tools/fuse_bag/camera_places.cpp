@@ -59,7 +59,10 @@ std::optional<Transform> CameraPlaces::extrinsics(const std::string& target,
   const auto known = extrinsics_.find(key);
   if (known != extrinsics_.end()) return known->second;
   const TransformAnswer answer = poses_.extrinsics(target, source);
-  if (!answer) DropLog::warn("no extrinsics " + answer.message + "; " + consequence);
+  if (!answer) {
+    DropLog::warn(consequence + ": " + answer.advice());
+    missing_.insert(answer.message);
+  }
   extrinsics_[key] = answer.transform;
   return answer.transform;
 }

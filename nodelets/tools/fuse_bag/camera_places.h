@@ -6,6 +6,7 @@
 #include <map>
 #include <memory>
 #include <optional>
+#include <set>
 #include <string>
 #include <utility>
 #include <vector>
@@ -30,6 +31,8 @@ class CameraPlaces {
   /// T_target_source, looked up once; where there is none it is told, with what that means.
   std::optional<Transform> extrinsics(const std::string& target, const std::string& source,
                                       const std::string& consequence);
+  /// Of each transform that was looked up and is not there, why.
+  const std::set<std::string>& missing() const { return missing_; }
   /// Whether a transform that was looked up has come to something else since.
   bool haveChanged() const;
 
@@ -44,6 +47,7 @@ class CameraPlaces {
   /// By camera.
   std::vector<std::vector<std::pair<CameraInfo, std::shared_ptr<const CameraModel>>>> models_;
   std::map<std::pair<std::string, std::string>, std::optional<Transform>> extrinsics_;
+  std::set<std::string> missing_;
 };
 
 }  // namespace semantic_lidar_fusion

@@ -77,8 +77,8 @@ void FusedOutput::planDrops(const BagScan& scan, bool has_vehicle_extrinsics, Tf
     // Said when they were looked for.
     result->drops.push_back({"scans: no extrinsics of the lidar", "", 1});
   } else if (!counters.reference_covered) {
-    result->drops.push_back({"scans: odometry does not cover t_ref",
-                             poses->gap(scan.reference_ns, scan.reference_ns), 1});
+    result->drops.push_back(
+        {"scans: no odometry for t_ref", poses->gap(scan.reference_ns, scan.reference_ns), 1});
   } else if (counters.marked_points + counters.dropped_points > 0) {
     result->drops.push_back({"firings: odometry does not cover them",
                              poses->gap(scan.times.interval.first_ns, scan.times.interval.last_ns),
@@ -157,6 +157,7 @@ void FusedOutput::count(const ScanTask& task, const OutputTask& result) {
   for (std::size_t c = 0; c < result.views.size(); ++c) {
     using Contribution = RunReport::Contribution;
     const std::string name = "camera " + rig_.cameras[c].name;
+    if (!result.places[c].model) drops_.add(name + ": no transform or no camera_info", 1);
     if (result.views[c].has_image) {
       report_.countCamera(c, Contribution::kUsed);
       continue;
@@ -164,7 +165,7 @@ void FusedOutput::count(const ScanTask& task, const OutputTask& result) {
     report_.countCamera(
         c, task.scan.image_stamps[c].has_value() ? Contribution::kLost : Contribution::kNone);
     if (hasImage(task.images[c])) {
-      drops_.count(name + ": odometry does not cover its image", name + ": " + result.gaps[c]);
+      drops_.count(name + ": no odometry for its image", name + ": " + result.gaps[c]);
     }
   }
   for (const OutputTask::Drop& drop : result.drops) {

@@ -6,7 +6,9 @@ is well, so that a bag with the wanted name is always a whole one. Messages of v
 read and written whether or not that package is installed.
 """
 
+import errno
 import os
+import tempfile
 from types import TracebackType
 from typing import (
     Any,
@@ -109,6 +111,18 @@ def _text(value: Any) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
+def _unread(what: str, error: Exception) -> DataError:
+    """What to raise where `what` cannot be read. genpy writes code for a bag's messages into the
+    temporary folder, whose disk may be full, and a disk may fail: neither is the bag's fault."""
+    code = error.errno if isinstance(error, OSError) else None
+    if code in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+        told = "%s: cannot be read: the temporary folder %s: %s; TMPDIR names another"
+        return DataError(told % (what, tempfile.gettempdir(), os.strerror(code or 0)))
+    if code in (errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ESTALE):
+        return DataError("%s: cannot be read: %s" % (what, os.strerror(code or 0)))
+    return DataError("%s: damaged (%s)" % (what, _told(error)))
+
+
 def _absolute(topic: str) -> str:
     return topic if topic.startswith("/") else "/" + topic
 
@@ -139,7 +153,7 @@ class RawMessage(NamedTuple):
             message = self.content[-1]()
             message.deserialize(self.content[1])
         except Exception as error:  # whatever genpy meets in a damaged message
-            raise DataError("%s: a message is damaged (%s)" % (self.topic, _told(error))) from error
+            raise _unread("%s: a message" % self.topic, error) from error
         return message
 
 
@@ -214,7 +228,7 @@ class BagReader:
             except StopIteration:
                 return
             except Exception as error:
-                raise DataError("%s: damaged (%s)" % (self.path, _told(error))) from error
+                raise _unread(self.path, error) from error
             yield entry
 
     def topics_of_type(self, type_name: str) -> List[str]:
