@@ -7,13 +7,13 @@
 
 #include "lens_parts.h"
 #include "polynomial.h"
+#include "semantic_lidar_fusion/common/rotation.h"
 
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr int kMaxImageSide = 32767;
-/// Largest entry of R R^T - 1: rotations are often written with few digits.
-constexpr double kRotationTolerance = 1e-2;
+/// Rectifications are often written with few digits.
+constexpr double kRectificationTolerance = 1e-2;
 
 std::string sourceOf(const CameraInfo& info) {
   return "camera_info of frame '" + info.frame_id + "'";
@@ -138,8 +138,7 @@ Eigen::Matrix3d checkedRotation(const CameraInfo& info) {
   }
   const Eigen::Matrix3d r =
       Eigen::Map<const Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(info.r.data());
-  const double error = (r * r.transpose() - Eigen::Matrix3d::Identity()).cwiseAbs().maxCoeff();
-  if (error > kRotationTolerance || r.determinant() < 0.0) {
+  if (rotationError(r) > kRectificationTolerance) {
     refuse(info, "R", "[" + std::to_string(r(0, 0)) + ", " + std::to_string(r(0, 1)) + ", ...]",
            "must be a rotation matrix, or all 0 for none");
   }

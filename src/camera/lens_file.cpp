@@ -9,6 +9,8 @@
 
 #include "polynomial.h"
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/rotation.h"
+#include "semantic_lidar_fusion/common/types.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 
 namespace semantic_lidar_fusion {
@@ -16,13 +18,12 @@ namespace {
 
 using Problems = std::vector<std::string>;
 
-constexpr double kMaxImageSide = 32767;
 constexpr NumberRange kFocal{0, 1e6, true};
 constexpr NumberRange kCentre{-1e6, 1e6};
 constexpr double kContradiction_deg = 1.0;
 constexpr double kContradiction_m = 0.05;
-/// Largest entry of R R^T - 1 of a transform that is written with few digits.
-constexpr double kRotationTolerance = 1e-3;
+/// Transforms are written with fewer digits than a double has.
+constexpr double kTransformTolerance = 1e-3;
 
 bool hasKey(const YAML::Node& node, const char* key) {
   return node.IsMap() && const_cast<const YAML::Node&>(node)[key].IsDefined();
@@ -81,9 +82,7 @@ std::optional<Transform> readTransform(YamlSection& section, const std::string& 
       result.matrix()(static_cast<int>(row), static_cast<int>(column)) = value;
     }
   }
-  const Eigen::Matrix3d r = result.linear();
-  const double error = (r * r.transpose() - Eigen::Matrix3d::Identity()).cwiseAbs().maxCoeff();
-  if (error > kRotationTolerance || r.determinant() < 0.0) {
+  if (rotationError(result.linear()) > kTransformTolerance) {
     section.problem(key, "must hold a rotation matrix");
     return std::nullopt;
   }

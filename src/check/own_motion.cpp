@@ -10,7 +10,7 @@ namespace semantic_lidar_fusion {
 namespace {
 
 constexpr std::size_t kRings = 16, kColumns = 360;
-constexpr float kNearest_m = 2.0f, kFarthest_m = 40.0f;
+constexpr float kNearestReturn_m = 2.0f, kFarthestReturn_m = 40.0f;
 constexpr double kLeastChange_m = 0.1, kMostChange_m = 1.5;
 constexpr std::size_t kFewestChanged = 100;
 constexpr double kLeastChangedShare = 0.05, kLeastQuarter = 0.05;
@@ -32,7 +32,7 @@ RangeGrid::RangeGrid(const TimedCloud& scan) {
   for (std::size_t i = 0; i < scan.size(); ++i) {
     if (scan.ring[i] == kNoRing || scan.ring[i] % every != 0) continue;
     const float range = std::hypot(scan.x[i], scan.y[i], scan.z[i]);
-    if (!(range > kNearest_m && range < kFarthest_m)) continue;
+    if (!(range > kNearestReturn_m && range < kFarthestReturn_m)) continue;
     const double column = (std::atan2(scan.y[i], scan.x[i]) / kPi + 1.0) * (kColumns / 2.0);
     const std::size_t whole = std::min(static_cast<std::size_t>(column), kColumns - 1);
     const std::size_t cell = scan.ring[i] / every * kColumns + whole;

@@ -6,6 +6,7 @@
 #include <limits>
 #include <tuple>
 
+#include "floor.h"
 #include "semantic_lidar_fusion/map/voxel_map.h"
 
 namespace semantic_lidar_fusion {
@@ -51,12 +52,6 @@ void forEachBit(std::uint64_t bits, Visit visit) {
   for (; bits != 0; bits &= bits - 1) visit(__builtin_ctzll(bits));
 }
 
-/// floor() of |value| < 2^31; the library's is a call on processors before SSE 4.1.
-inline std::int32_t floorOf(double value) {
-  const auto whole = static_cast<std::int32_t>(value);
-  return whole - (value < static_cast<double>(whole) ? 1 : 0);
-}
-
 /// planes = count, up to kMaxPasses.
 void setCount(std::uint32_t count, int word, std::uint64_t bit, FreeBrick* brick) {
   for (int k = 0; k < FreeBrick::kPlanes; ++k) {
@@ -73,7 +68,7 @@ VoxelKey movedVoxel(const VoxelKey& ours, const MovedVoxels& theirs_ours) {
   for (std::size_t axis = 0; axis < 3; ++axis) {
     const auto& t = theirs_ours[axis];
     const double rest = t[1] * (ours[1] + 0.5) + t[2] * (ours[2] + 0.5) + t[3];
-    result[axis] = floorOf(t[0] * (ours[0] + 0.5) + rest);
+    result[axis] = floorTo<std::int32_t>(t[0] * (ours[0] + 0.5) + rest);
   }
   return result;
 }
@@ -258,8 +253,8 @@ void FreeSpace::addMoved(const std::vector<FreeBrick>& bricks, const MovedVoxels
           double here = -0.5;
           for (std::size_t row = 0; row < 3; ++row)
             here += theirs_ours[row][axis] * (theirs[row] + 0.5 - theirs_ours[row][3]);
-          low[axis] = -floorOf(reach[axis] - here);
-          high[axis] = floorOf(here + reach[axis]);
+          low[axis] = -floorTo<std::int32_t>(reach[axis] - here);
+          high[axis] = floorTo<std::int32_t>(here + reach[axis]);
         }
         for (std::int32_t z = low[2]; z <= high[2]; ++z) {
           for (std::int32_t y = low[1]; y <= high[1]; ++y) {

@@ -8,6 +8,7 @@
 #include <string>
 #include <tuple>
 
+#include "floor.h"
 #include "map_kernels.h"
 #include "semantic_lidar_fusion/common/error.h"
 
@@ -30,12 +31,6 @@ Value valueAt(const Column& column, std::size_t row) {
   Value value;
   std::memcpy(&value, column.data + static_cast<std::ptrdiff_t>(row) * column.stride, sizeof value);
   return value;
-}
-
-/// floor() of |value| < 2^62; the library's is a call on processors before SSE 4.1.
-inline std::int64_t floorOf(double value) {
-  const std::int64_t whole = static_cast<std::int64_t>(value);
-  return whole - (value < static_cast<double>(whole) ? 1 : 0);
 }
 
 std::uint64_t packXy(std::int32_t x, std::int32_t y) {
@@ -278,7 +273,8 @@ IntegrationCounts VoxelMap::integrate(const SemanticPoints& points, const Transf
     float intensity = points.intensity.data ? valueAt<float>(points.intensity, i) : 0.0f;
     if (!(std::abs(intensity) <= kMaxIntensity)) intensity = 0.0f;
     batch.passes[row] = points.passes.data ? valueAt<std::uint8_t>(points.passes, i) : 0;
-    batch.intensity[row] = floorOf(static_cast<double>(intensity) * kIntensityUnit + 0.5);
+    batch.intensity[row] =
+        floorTo<std::int64_t>(static_cast<double>(intensity) * kIntensityUnit + 0.5);
     batch.placed.x[row] = x;
     batch.placed.y[row] = y;
     batch.placed.z[row] = z;

@@ -23,7 +23,7 @@ constexpr StampNs kSegmentNs = kNsPerSecond;
 /// Points that are worked on together.
 constexpr int kBlock = 256;
 
-const MotionKernels& kernels() {
+const MotionKernels& motionKernels() {
   static const MotionKernelList list = usableMotionKernels();
   return *list.kernels[list.count - 1];
 }
@@ -355,10 +355,10 @@ std::size_t moveByTime(const std::vector<StampNs>& times, std::size_t begin, std
   std::size_t at = begin;
   do {
     wanted = static_cast<int>(std::min<std::size_t>(kBlock, end - at));
-    within = kernels().timesWithin(&times[at], wanted, segment.begin_ns, length, ns);
+    within = motionKernels().timesWithin(&times[at], wanted, segment.begin_ns, length, ns);
     // A point out of its firing's time takes the segment that is nearest.
     if (at == begin) within = std::max(within, 1);
-    kernels().move(segment.motion, ns, within, &cloud->x[at], &cloud->y[at], &cloud->z[at]);
+    motionKernels().move(segment.motion, ns, within, &cloud->x[at], &cloud->y[at], &cloud->z[at]);
     at += static_cast<std::size_t>(within);
   } while (within == wanted && at < end);
   return at;
@@ -375,8 +375,8 @@ void moveAt(StampNs time, std::size_t begin, std::size_t end, const Segment& seg
   }
   const float zeros[kBlock] = {};
   for (std::size_t at = begin; at < end; at += kBlock) {
-    kernels().move(still, zeros, static_cast<int>(std::min<std::size_t>(kBlock, end - at)),
-                   &cloud->x[at], &cloud->y[at], &cloud->z[at]);
+    motionKernels().move(still, zeros, static_cast<int>(std::min<std::size_t>(kBlock, end - at)),
+                         &cloud->x[at], &cloud->y[at], &cloud->z[at]);
   }
 }
 
@@ -449,8 +449,8 @@ std::vector<float> secondsSince(StampNs reference_ns, const std::vector<StampNs>
   std::vector<float> seconds(times.size());
   constexpr StampNs kNear = std::numeric_limits<std::int32_t>::max();
   if (span.first_ns >= reference_ns - kNear && span.last_ns <= reference_ns + kNear) {
-    kernels().secondsSince(reference_ns, times.data(), static_cast<int>(times.size()),
-                           seconds.data());
+    motionKernels().secondsSince(reference_ns, times.data(), static_cast<int>(times.size()),
+                                 seconds.data());
   } else {
     for (std::size_t i = 0; i < times.size(); ++i) {
       seconds[i] = static_cast<float>(toSeconds(times[i] - reference_ns));

@@ -5,11 +5,12 @@
 #include <string>
 
 #include "semantic_lidar_fusion/common/error.h"
+#include "semantic_lidar_fusion/common/rotation.h"
 
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kRotationTolerance = 1e-3;
+constexpr double kPoseTolerance = 1e-3;
 /// What noise and small corrections of an odometry add to a step, however short it is.
 constexpr double kSlackM = 0.2, kSlackRad = 0.2;
 constexpr double kFastestTurnRadS = 20.0;
@@ -18,12 +19,12 @@ constexpr double kToAndFroM = 0.3;
 constexpr StampNs kToAndFroNs = 500000000;
 constexpr StampNs kLeastTwistSpan_ns = 10000000;
 
-bool isBefore(const StampedPose& reading, StampNs t) { return reading.stamp < t; }
+bool isEarlier(const StampedPose& reading, StampNs t) { return reading.stamp < t; }
 
 /// First reading at or after `t`.
 std::deque<StampedPose>::const_iterator atOrAfter(const std::deque<StampedPose>& readings,
                                                   StampNs t) {
-  return std::lower_bound(readings.begin(), readings.end(), t, isBefore);
+  return std::lower_bound(readings.begin(), readings.end(), t, isEarlier);
 }
 
 void check(const StampedPose& reading) {
@@ -32,10 +33,9 @@ void check(const StampedPose& reading) {
     throw DataError(name + "its pose has a NaN or infinite entry, every entry must be finite");
   }
   const Eigen::Matrix3d rotation = reading.T_fixed_vehicle.linear();
-  const double deviation =
-      (rotation.transpose() * rotation - Eigen::Matrix3d::Identity()).cwiseAbs().maxCoeff();
-  if (deviation > kRotationTolerance || rotation.determinant() < 0.0) {
-    throw DataError(name + "its rotation is not orthonormal (R^T R deviates from I by " +
+  const double deviation = rotationError(rotation);
+  if (deviation > kPoseTolerance) {
+    throw DataError(name + "its rotation is not orthonormal (R R^T deviates from I by " +
                     std::to_string(deviation) + ", determinant " +
                     std::to_string(rotation.determinant()) + ", at most 0.001 and +1 are allowed)");
   }
@@ -71,7 +71,7 @@ Transform interpolate(const Transform& a, const Transform& b, double fraction) {
 
 void PoseBuffer::add(const StampedPose& reading) {
   check(reading);
-  const auto place = std::lower_bound(readings_.begin(), readings_.end(), reading.stamp, isBefore);
+  const auto place = std::lower_bound(readings_.begin(), readings_.end(), reading.stamp, isEarlier);
   const auto index = static_cast<std::size_t>(place - readings_.begin());
   if (place != readings_.end() && place->stamp == reading.stamp) {
     *place = reading;

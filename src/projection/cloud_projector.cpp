@@ -21,7 +21,7 @@ constexpr double kThetaSlack_rad = 2e-6;
 /// gives to 0.02 px.
 constexpr double kMostSinglePrecision_px = 10000.0;
 
-const ProjectionKernels& kernels() {
+const ProjectionKernels& projectionKernels() {
   static const ProjectionKernelList list = usableProjectionKernels();
   return *list.kernels[list.count - 1];
 }
@@ -132,7 +132,7 @@ class FastEquidistant {
                const Bounds& bounds, const Cloud& cloud, ProjectedPoints* points) {
     const int kept = motion != nullptr
                          ? rolled(selected, count, first, T_camera_lidar, camera, *motion, cloud)
-                         : kernels().equidistant(lens_, selected, count, &block_);
+                         : projectionKernels().equidistant(lens_, selected, count, &block_);
     int begin = 0;
     for (int k = 0; k < block_.doubtful_count; ++k) {
       const int doubtful = static_cast<int>(block_.doubtful[k]);
@@ -173,7 +173,7 @@ class FastEquidistant {
       flow.apply(time_, kept, &moved_);
     };
 
-    int kept = kernels().equidistant(anywhere, selected, count, &block_);
+    int kept = projectionKernels().equidistant(anywhere, selected, count, &block_);
     rows.times(block_, kept, time_);
     for (int k = 0; k < block_.doubtful_count; ++k) time_[block_.doubtful[k]] = 0.0f;
     std::copy_n(block_.place, kept, moved_.place);
@@ -185,7 +185,7 @@ class FastEquidistant {
     std::copy_n(time_, kept, earlier);
     std::copy_n(moved_.place, kept, place);
     for (int k = 0; k < kept; ++k) moved_.place[k] = static_cast<std::uint32_t>(k);
-    kept = kernels().equidistant(anywhere, moved_, kept, &block_);
+    kept = projectionKernels().equidistant(anywhere, moved_, kept, &block_);
     rows.times(block_, kept, time_);
     for (int k = 0; k < block_.doubtful_count; ++k) {
       time_[block_.doubtful[k]] = earlier[block_.place[block_.doubtful[k]]];
@@ -196,7 +196,7 @@ class FastEquidistant {
       moved_.place[k] = place[before];
     }
     move(kept);
-    return kernels().equidistant(lens_, moved_, kept, &block_);
+    return projectionKernels().equidistant(lens_, moved_, kept, &block_);
   }
 
   EquidistantLens lens_;
@@ -259,10 +259,10 @@ ProjectedPoints projectCloud(const Cloud& cloud, const Transform& T_camera_lidar
   for (std::size_t first = 0; first < cloud.size(); first += kProjectionBlock) {
     const int block =
         static_cast<int>(std::min<std::size_t>(kProjectionBlock, cloud.size() - first));
-    const int count =
-        kernels().select(cone, cloud.x.data() + first, cloud.y.data() + first,
-                         cloud.z.data() + first, cloud.status.data() + first,
-                         static_cast<std::uint8_t>(PointStatus::kNoOdometry), block, &selected);
+    const int count = projectionKernels().select(
+        cone, cloud.x.data() + first, cloud.y.data() + first, cloud.z.data() + first,
+        cloud.status.data() + first, static_cast<std::uint8_t>(PointStatus::kNoOdometry), block,
+        &selected);
     const auto base = static_cast<std::uint32_t>(first);
     if (fast) {
       equidistant->project(selected, count, base, T_camera_lidar, camera, motion, bounds, cloud,

@@ -23,7 +23,6 @@ namespace {
 /// Distance below the cell's least score of a class that the network does not know.
 constexpr float kMissingClassGap = 20.0f;
 constexpr int kMaxSide = 16384;
-constexpr int kMaxChannels = 4096;
 
 using Problems = std::vector<std::string>;
 
@@ -91,7 +90,7 @@ void readInput(const YAML::Node& node, Problems* problems, Description* out) {
 /// A list of output channels; absent, it leaves `channels` empty.
 void readChannels(YamlSection* section, const std::string& key, std::vector<int>* channels) {
   std::vector<double> read;
-  section->numbers(key, &read, {0, kMaxChannels - 1, false});
+  section->numbers(key, &read, {0, kMaxNetworkChannels - 1, false});
   for (const double channel : read) {
     if (channel == std::floor(channel)) {
       channels->push_back(static_cast<int>(channel));

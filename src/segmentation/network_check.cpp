@@ -25,7 +25,6 @@ extern char** environ;
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr int kMaxChannels = 4096;
 /// An output is no larger than the input enlarged by this, each way, and no layer has more values
 /// than this many channels of the input's size.
 constexpr int kMaxEnlargement = 4;
@@ -227,10 +226,10 @@ NetworkShape outputShape(const cv::dnn::Net& net, const ImageSize& input) {
       out[0][3] < 1) {
     throw DataError("output is " + shapeText(out) + ", must be 1 x channels x rows x columns");
   }
-  if (out[0][1] > kMaxChannels || out[0][2] > kMaxEnlargement * input.height ||
+  if (out[0][1] > kMaxNetworkChannels || out[0][2] > kMaxEnlargement * input.height ||
       out[0][3] > kMaxEnlargement * input.width) {
     throw DataError("output is " + shapeText(out) + ", must have at most " +
-                    std::to_string(kMaxChannels) + " channels and " +
+                    std::to_string(kMaxNetworkChannels) + " channels and " +
                     std::to_string(kMaxEnlargement) + " times the input's rows and columns");
   }
   return {out[0][1], out[0][2], out[0][3]};

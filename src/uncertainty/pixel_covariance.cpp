@@ -13,7 +13,7 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-const CovarianceKernels& kernels() {
+const CovarianceKernels& covarianceKernels() {
   static const CovarianceKernelList list = usableCovarianceKernels();
   return *list.kernels[list.count - 1];
 }
@@ -72,14 +72,14 @@ class Covariances {
   void of(const std::uint32_t* places, int count, float* uu, float* uv, float* vv) {
     for (int i = 0; i < count; ++i) place(i, places[i]);
     if (fast_) {
-      kernels().equidistant(fit_, count, &block_);
+      covarianceKernels().equidistant(fit_, count, &block_);
     } else {
       for (int i = 0; i < count; ++i) takeJacobian(i);
     }
     if (motion_ != nullptr) {
       for (int i = 0; i < count; ++i) meetAnotherRow(i);
     }
-    kernels().covariances(constants_, has_odometry_, has_beam_, count, &block_);
+    covarianceKernels().covariances(constants_, has_odometry_, has_beam_, count, &block_);
     std::copy_n(block_.uu, count, uu);
     std::copy_n(block_.uv, count, uv);
     std::copy_n(block_.vv, count, vv);

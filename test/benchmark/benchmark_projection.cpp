@@ -26,7 +26,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr int kCameras = 5;
 constexpr int kClasses = 12;
 

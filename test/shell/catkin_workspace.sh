@@ -14,13 +14,13 @@ mkdir -p "$workspace/src"
 ln -s "$SLF_SOURCE_DIR" "$workspace/src/$package"
 log=$SLF_BUILD_DIR/catkin_workspace.log
 # The devel space of the surrounding build must not serve here. A debug build also compiles what a
-# release build leaves out.
+# release build leaves out, and each file by itself shows what it does not include.
 (
   unset CMAKE_PREFIX_PATH ROS_PACKAGE_PATH PYTHONPATH LD_LIBRARY_PATH
   set +u
   [ ! -f /opt/ros/noetic/setup.bash ] || source /opt/ros/noetic/setup.bash
   catkin_make -C "$workspace" -j"${SLF_JOBS:-2}" install -DCMAKE_BUILD_TYPE=Debug \
-    -DCATKIN_ENABLE_TESTING=OFF -DPYTHON_EXECUTABLE=/usr/bin/python3 \
+    -DCMAKE_UNITY_BUILD=OFF -DCATKIN_ENABLE_TESTING=OFF -DPYTHON_EXECUTABLE=/usr/bin/python3 \
     -DPython3_EXECUTABLE=/usr/bin/python3
 ) >"$log" 2>&1 ||
   fail "catkin_make failed: $(tail -15 "$log")"

@@ -49,6 +49,9 @@ inline Twist twistOf(const Transform& T_body_other, const Twist& other) {
   return {T_body_other.linear() * other.velocity + T_body_other.translation().cross(turn), turn};
 }
 
+/// Largest width and height, px.
+constexpr int kMaxImageSide = 32767;
+
 struct ImageSize {
   int width = 0;
   int height = 0;

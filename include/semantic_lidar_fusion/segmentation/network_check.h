@@ -10,6 +10,8 @@
 
 namespace semantic_lidar_fusion {
 
+constexpr int kMaxNetworkChannels = 4096;
+
 /// The size of a network's output.
 struct NetworkShape {
   int channels = 0;

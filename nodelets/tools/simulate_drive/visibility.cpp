@@ -11,7 +11,6 @@ namespace semantic_lidar_fusion {
 namespace simulator {
 namespace {
 
-constexpr float kPiF = static_cast<float>(kPi);
 constexpr float kRingRad = 2.0F * kPiF / 180.0F;
 /// A camera sees a point if its ray meets nothing this much before it: share of the range, and m.
 constexpr double kSeenShare = 1e-4, kSeenM = 2e-3;

@@ -13,7 +13,6 @@ namespace simulator {
 namespace {
 
 constexpr double kLongestStepS = 0.004;
-constexpr float kPiF = static_cast<float>(kPi);
 
 void setTransform(RTCGeometry geometry, unsigned step, const Transform& T) {
   float columns[12];

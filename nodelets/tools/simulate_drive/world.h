@@ -14,6 +14,8 @@
 namespace semantic_lidar_fusion {
 namespace simulator {
 
+constexpr float kPiF = static_cast<float>(kPi);
+
 /// Ids of config/classes_usyd12.yaml.
 enum class Class : std::uint8_t {
   kUnlabeled,

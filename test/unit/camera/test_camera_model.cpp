@@ -8,13 +8,13 @@
 #include <opencv2/calib3d.hpp>
 #include <random>
 
+#include "direction.h"
 #include "semantic_lidar_fusion/camera/camera_model.h"
 #include "semantic_lidar_fusion/common/error.h"
 
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 /// Of the issue: agreement with OpenCV where its functions are valid.
 constexpr double kOpencvTolerancePx = 1e-3;
 /// Of a double-precision round trip at focal lengths near 1000 px: 1e-16 * 1000 px, times the
@@ -36,10 +36,6 @@ CameraInfo baseInfo(const std::string& model, std::vector<double> d) {
 
 /// The reference rig's lens: monotone up to 180 deg.
 CameraInfo fisheyeInfo() { return baseInfo("equidistant", {-0.0557, 0.0173, -0.0019, 0.00007}); }
-
-Eigen::Vector3d direction(double theta, double phi) {
-  return {std::sin(theta) * std::cos(phi), std::sin(theta) * std::sin(phi), std::cos(theta)};
-}
 
 /// Closed form of eq. 7-11 with the angle from the axis.
 Eigen::Vector2d closedFormFisheye(const CameraInfo& info, double theta, double phi) {

@@ -54,7 +54,7 @@ cam4:
 )";
 
 /// KITTI-360's own form and published numbers.
-const char* const kKitti360 = R"(%YAML:1.0
+const char* const kKitti360File = R"(%YAML:1.0
 ---
 model_type: MEI
 camera_name: image_02
@@ -125,7 +125,7 @@ TEST(LensFile, ReadsKalibrCamchains) {
 
 TEST(LensFile, ReadsKitti360AndItsPublishedLens) {
   const TemporaryFolder folder;
-  const LensCalibration lens = loadLens(write(folder, "image_02.yaml", kKitti360), "");
+  const LensCalibration lens = loadLens(write(folder, "image_02.yaml", kKitti360File), "");
   EXPECT_EQ(lens.size, (ImageSize{1400, 1400}));
   CameraModelOptions options;
   options.lens = std::make_shared<const LensCalibration>(lens);
@@ -220,10 +220,10 @@ TEST(LensFile, EveryProblemIsNamed) {
       {replaced(kCamchain, "[1.0, 0.0, 0.0, -0.25]", "[2.0, 0.0, 0.0, -0.25]"), "cam1",
        "cam1.T_cn_cnm1"},
       {replaced(kCamchain, "[1.25,", "[-1.25,"), "cam1", "xi = -1.25: must lie in 0..100"},
-      {replaced(kKitti360, "MEI", "SCARAMUZZA"), "", "model_type = SCARAMUZZA: must be MEI"},
-      {replaced(kKitti360, "   k2: 1.6548773243373522e+00\n", ""), "",
+      {replaced(kKitti360File, "MEI", "SCARAMUZZA"), "", "model_type = SCARAMUZZA: must be MEI"},
+      {replaced(kKitti360File, "   k2: 1.6548773243373522e+00\n", ""), "",
        "distortion_parameters.k2 = (missing): must be given"},
-      {kKitti360, "image_03", "camera_name = image_02: must be the camera 'image_03'"},
+      {kKitti360File, "image_03", "camera_name = image_02: must be the camera 'image_03'"},
       {replaced(kOcam, "ocam", "ocamm"), "", "model = ocamm: must be one of pinhole"},
       {replaced(kOcam, "coefficients", "coefficient"), "", "coefficient"},
       {kOcam, "front", "must be left out"},

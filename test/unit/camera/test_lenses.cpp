@@ -11,6 +11,7 @@
 #endif
 #include <random>
 
+#include "direction.h"
 #include "semantic_lidar_fusion/camera/camera_model.h"
 #include "semantic_lidar_fusion/camera/lens.h"
 #include "semantic_lidar_fusion/common/error.h"
@@ -18,7 +19,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
 /// Of the issue.
 constexpr double kRoundTrip_rad = 1e-9;
 
@@ -76,10 +76,6 @@ std::string nameOf(const NamedLens& lens) {
   std::string text = lens.model;
   for (const double d : lens.d) text += " " + std::to_string(d);
   return text;
-}
-
-Eigen::Vector3d direction(double theta, double phi) {
-  return {std::sin(theta) * std::cos(phi), std::sin(theta) * std::sin(phi), std::cos(theta)};
 }
 
 Eigen::Vector3d randomDirection(std::mt19937* random) {

@@ -14,12 +14,10 @@
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/common/yaml_reader.h"
 #include "semantic_lidar_fusion/fusion/scan_pipeline.h"
+#include "stamps.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr StampNs kStart = 1500000000 * kNsPerSecond;
-constexpr StampNs kMs = 1000000;
 
 /// Two cameras, the second one 10 ms early; 12 classes.
 Rig rig(const std::string& more = "") {
@@ -72,7 +70,7 @@ TimedCloud scan() {
   return cloud;
 }
 
-std::shared_ptr<const CameraModel> pinhole() {
+std::shared_ptr<const CameraModel> smallPinhole() {
   CameraInfo info;
   info.frame_id = "camera";
   info.size = {640, 400};
@@ -167,7 +165,7 @@ TEST(ScanPipelineTest, ARollingShutterGetsTheMotionOfItsCamera) {
     }
   }
   EXPECT_FALSE(
-      pipeline.view(0, {pinhole(), T_camera_lidar}, &seen, t_image, drive(), T_vehicle_lidar)
+      pipeline.view(0, {smallPinhole(), T_camera_lidar}, &seen, t_image, drive(), T_vehicle_lidar)
           .motion);
   // Not known to move, not known where its rows were.
   EXPECT_FALSE(pipeline.view(0, place, &seen, t_image, PoseBuffer(), T_vehicle_lidar).has_image);
@@ -180,7 +178,7 @@ TEST(ScanPipelineTest, ARollingShutterGetsTheMotionOfItsCamera) {
 TEST(ScanPipelineTest, AViewMovesWithTheVehicleToTheTimeOfItsImage) {
   const ScanPipeline pipeline(rig(), {PipelineStep::kView});
   const Transform T_vehicle_lidar = mounted(1.0, 0.1), T_camera_lidar = mounted(-0.4, 1.2);
-  const CameraPlace place{pinhole(), T_camera_lidar};
+  const CameraPlace place{smallPinhole(), T_camera_lidar};
   const PoseBuffer odometry = drive();
   SegmentedImage taken;
   taken.stamp = kStart + 40 * kMs;
@@ -206,7 +204,7 @@ TEST(ScanPipelineTest, AViewMovesWithTheVehicleToTheTimeOfItsImage) {
 
 TEST(ScanPipelineTest, AViewHasNoImageWithoutOdometryModelOrExtrinsics) {
   const ScanPipeline pipeline(rig(), {PipelineStep::kView});
-  const CameraPlace place{pinhole(), Transform::Identity()};
+  const CameraPlace place{smallPinhole(), Transform::Identity()};
   const PoseBuffer odometry = drive();
   SegmentedImage taken;
   taken.stamp = kStart;
@@ -261,7 +259,7 @@ TEST(ScanPipelineTest, RowsAreThoseOfTheRigUnlessItSaysAuto) {
     pipeline.segment(0, &found);
     // Blocks of 16 of 40 rows.
     EXPECT_EQ(found.superpixels.rows, finds ? cv::Range(0, 16) : cv::Range(16, 40));
-    const CameraView view = pipeline.view(0, {pinhole(), mounted(-0.4, 1.2)}, &found, kStart,
+    const CameraView view = pipeline.view(0, {smallPinhole(), mounted(-0.4, 1.2)}, &found, kStart,
                                           drive(), mounted(1.0, 0.1));
     EXPECT_EQ(view.lidar_rows.first, finds ? 0.0 : 0.5);
     EXPECT_EQ(view.lidar_rows.last, finds ? 0.3 : 1.0);

@@ -13,6 +13,7 @@
 #include <random>
 #include <string>
 
+#include "not_finite.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/fusion/semantic_projector.h"
 #include "semantic_lidar_fusion/projection/cloud_projector.h"
@@ -22,7 +23,6 @@ namespace semantic_lidar_fusion {
 namespace {
 
 constexpr StampNs kReference = 1600000000000000000;
-constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
 
 std::shared_ptr<const CameraModel> makeModel(const std::string& distortion, const ImageSize& size,
                                              double focal_px) {

@@ -17,12 +17,10 @@
 #include "packet_encoder.h"
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/lidar/packet_decoder.h"
+#include "stamps.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr double kPi = 3.14159265358979323846;
-constexpr StampNs kStart = 1673400472138016708;
 
 struct Point {
   double x = 0.0, y = 0.0, z = 0.0;
@@ -135,7 +133,7 @@ class EveryModel : public ::testing::TestWithParam<std::tuple<std::string, bool>
     PacketEncoder::Config config;
     config.model = std::get<0>(GetParam());
     config.dual_return = std::get<1>(GetParam());
-    config.start_ns = kStart;
+    config.start_ns = kUnroundStart;
     return config;
   }
 };
@@ -151,9 +149,9 @@ TEST_P(EveryModel, GivesBackTheWorldAcrossTheFullTurn) {
   config.rotation_hz = exactRotationHz(config.model, config.dual_return);
   config.start_azimuth_deg = 340.0;
   const Scan scan = makeScan(config, 20);
-  const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, kStart + 7, "velodyne");
+  const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, kUnroundStart + 7, "velodyne");
   EXPECT_EQ(decoded.cloud.frame_id, "velodyne");
-  EXPECT_EQ(decoded.cloud.header_stamp, kStart + 7);
+  EXPECT_EQ(decoded.cloud.header_stamp, kUnroundStart + 7);
   EXPECT_EQ(decoded.counters.packets, 20u);
   EXPECT_EQ(decoded.counters.bad_blocks, 0u);
   EXPECT_TRUE(decoded.counters.unknown_packets.empty());
@@ -168,7 +166,7 @@ TEST_P(EveryModel, StaysWithinTheAzimuthsResolutionAtAnySpeed) {
     config.rotation_hz = hz;
     config.start_azimuth_deg = 123.456;
     const Scan scan = makeScan(config, 20);
-    const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, kStart, "velodyne");
+    const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, kUnroundStart, "velodyne");
     expectSame(decoded.cloud, scan.truth, 0.0151 * kPi / 180.0);
   }
 }
@@ -176,7 +174,7 @@ TEST_P(EveryModel, StaysWithinTheAzimuthsResolutionAtAnySpeed) {
 TEST_P(EveryModel, GroupsPointsToTheirFirings) {
   PacketEncoder::Config config = this->config();
   const Scan scan = makeScan(config, 5);
-  const TimedCloud cloud = PacketDecoder({}).decode(scan.packets, kStart, "velodyne").cloud;
+  const TimedCloud cloud = PacketDecoder({}).decode(scan.packets, kUnroundStart, "velodyne").cloud;
   ASSERT_FALSE(cloud.firings.empty());
   std::vector<Firing> seen = cloud.firings;
   for (Firing& firing : seen) std::swap(firing.begin_ns, firing.end_ns);
@@ -188,7 +186,7 @@ TEST_P(EveryModel, GroupsPointsToTheirFirings) {
     ASSERT_GE(firing.end_ns, cloud.time_ns[i]);
     ASSERT_LT(firing.end_ns - firing.begin_ns, findLidarSpec(config.model)->firing_ns);
     ASSERT_EQ(static_cast<StampNs>(firing.packet),
-              (cloud.time_ns[i] - kStart) / encoder.packetNs());
+              (cloud.time_ns[i] - kUnroundStart) / encoder.packetNs());
     Firing& mine = seen[cloud.firing[i]];
     mine.begin_ns = std::min(mine.begin_ns, cloud.time_ns[i]);
     mine.end_ns = std::max(mine.end_ns, cloud.time_ns[i]);
@@ -202,7 +200,7 @@ TEST_P(EveryModel, GroupsPointsToTheirFirings) {
 /// A packet written byte by byte from the manual's figures, without the encoder.
 Packet vlp16Packet(std::uint8_t mode = 0x37, std::uint8_t factory = 0x22) {
   Packet packet;
-  packet.stamp = kStart;
+  packet.stamp = kUnroundStart;
   for (int b = 0; b < 12; ++b) {
     std::uint8_t* const block = packet.data.data() + 100 * b;
     block[0] = 0xFF;
@@ -228,7 +226,7 @@ TEST(PacketDecoder, ReadsAPacketWrittenByHand) {
   setReturn(packet, 0, 0, 5000, 11);        // laser 0, -15 deg, 10 m
   setReturn(packet, 2, 16 + 3, 10000, 22);  // second firing, laser 3, +3 deg, 20 m, 359.8 deg
   setReturn(packet, 11, 31, 500, 33);       // the last one, laser 15, +15 deg, 1 m
-  const TimedCloud cloud = PacketDecoder({}).decode({packet}, kStart, "velodyne").cloud;
+  const TimedCloud cloud = PacketDecoder({}).decode({packet}, kUnroundStart, "velodyne").cloud;
   ASSERT_EQ(cloud.size(), 3u);
   const auto expect = [&](std::size_t i, double d, double azimuth_deg, double elevation_deg,
                           int ring, int intensity, double time_us) {
@@ -239,7 +237,7 @@ TEST(PacketDecoder, ReadsAPacketWrittenByHand) {
     EXPECT_NEAR(cloud.z[i], d * std::sin(el), 2e-6);
     EXPECT_EQ(cloud.ring[i], ring);
     EXPECT_EQ(cloud.intensity[i], static_cast<float>(intensity));
-    EXPECT_EQ(cloud.time_ns[i] - kStart, std::llround(time_us * 1e3));
+    EXPECT_EQ(cloud.time_ns[i] - kUnroundStart, std::llround(time_us * 1e3));
   };
   expect(0, 10.0, 359.0, -15.0, 0, 11, 0.0);
   expect(1, 20.0, 359.8 + 0.4 * (55.296 + 3 * 2.304) / 110.592, 3.0, 9, 22, 5 * 55.296 + 3 * 2.304);
@@ -258,7 +256,7 @@ TEST(PacketDecoder, DropsASecondReturnThatEqualsTheFirst) {
   setReturn(packet, 2, 6, 4000, 50);
   setReturn(packet, 3, 6, 3000, 50);  // another range
   setReturn(packet, 5, 7, 2000, 50);  // a second one without a first
-  const DecodedScan scan = PacketDecoder({}).decode({packet}, kStart, "velodyne");
+  const DecodedScan scan = PacketDecoder({}).decode({packet}, kUnroundStart, "velodyne");
   ASSERT_EQ(scan.cloud.size(), 4u);
   EXPECT_EQ(scan.counters.equal_returns, 1u);
   EXPECT_NEAR(scan.cloud.z[2], 6.0 * std::sin(-9.0 * kPi / 180.0), 1e-6);
@@ -275,7 +273,7 @@ TEST(PacketDecoder, TakesTheModelFromTheFactoryByteUnlessItIsGiven) {
     packet.data[1205] = factory;
     PacketDecoderConfig config;
     config.model = model;
-    const TimedCloud cloud = PacketDecoder(config).decode({packet}, kStart, "v").cloud;
+    const TimedCloud cloud = PacketDecoder(config).decode({packet}, kUnroundStart, "v").cloud;
     const double d = std::hypot(std::hypot(cloud.x.at(0), cloud.y.at(0)), cloud.z.at(0));
     return std::make_pair(std::asin(cloud.z.at(0) / d) * 180.0 / kPi, d);
   };
@@ -300,7 +298,8 @@ TEST(PacketDecoder, CountsUnknownPacketsAndNamesTheByte) {
   Packet mode = good;
   mode.stamp += 2;
   mode.data[1204] = 0x3C;
-  const DecodedScan scan = PacketDecoder({}).decode({sensor, good, mode}, kStart, "velodyne");
+  const DecodedScan scan =
+      PacketDecoder({}).decode({sensor, good, mode}, kUnroundStart, "velodyne");
   EXPECT_EQ(scan.cloud.size(), 1u);
   ASSERT_EQ(scan.counters.unknown_packets.size(), 2u);
   const auto first = scan.counters.unknown_packets.begin();
@@ -311,17 +310,17 @@ TEST(PacketDecoder, CountsUnknownPacketsAndNamesTheByte) {
 
 TEST(PacketDecoder, BadBlocksAreSkippedAndHarmNoOther) {
   PacketEncoder::Config config;
-  config.start_ns = kStart;
+  config.start_ns = kUnroundStart;
   config.rotation_hz = exactRotationHz(config.model, false);
   const Scan scan = makeScan(config, 3);
   std::vector<Packet> packets = scan.packets;
   packets[1].data[100 * 4] = 0;          // flag
   packets[1].data[100 * 5 + 3] = 0xFF;   // azimuth 65 xxx
   packets[2].data[100 * 11 + 1] = 0x00;  // the last block
-  const DecodedScan decoded = PacketDecoder({}).decode(packets, kStart, "velodyne");
+  const DecodedScan decoded = PacketDecoder({}).decode(packets, kUnroundStart, "velodyne");
   EXPECT_EQ(decoded.counters.bad_blocks, 3u);
   const auto inBadBlock = [&](const Point& point) {
-    const StampNs block = (point.time_ns - kStart) / 110592;
+    const StampNs block = (point.time_ns - kUnroundStart) / 110592;
     return block == 12 + 4 || block == 12 + 5 || block == 24 + 11;
   };
   std::vector<Point> truth = scan.truth;
@@ -332,21 +331,22 @@ TEST(PacketDecoder, BadBlocksAreSkippedAndHarmNoOther) {
 
 TEST(PacketDecoder, ALoneBlockGoesOnTurningAsThePacketBefore) {
   PacketEncoder::Config config;
-  config.start_ns = kStart;
+  config.start_ns = kUnroundStart;
   config.rotation_hz = exactRotationHz(config.model, false);
   const Scan scan = makeScan(config, 2);
   std::vector<Packet> packets = scan.packets;
   for (int b = 1; b < 12; ++b) packets[1].data[100 * b] = 0;
   std::vector<Point> truth = scan.truth;
-  truth.erase(std::remove_if(truth.begin(), truth.end(),
-                             [](const Point& p) { return p.time_ns >= kStart + 1327104 + 110592; }),
-              truth.end());
-  expectSame(PacketDecoder({}).decode(packets, kStart, "velodyne").cloud, truth, 0.0);
+  truth.erase(
+      std::remove_if(truth.begin(), truth.end(),
+                     [](const Point& p) { return p.time_ns >= kUnroundStart + 1327104 + 110592; }),
+      truth.end());
+  expectSame(PacketDecoder({}).decode(packets, kUnroundStart, "velodyne").cloud, truth, 0.0);
 }
 
 TEST(PacketDecoder, ShuffledDuplicatedMissingAndEmptyPacketsLeaveTheRestAsItIs) {
   PacketEncoder::Config config;
-  config.start_ns = kStart;
+  config.start_ns = kUnroundStart;
   const Scan scan = makeScan(config, 76);
   std::mt19937 random(4);
   std::vector<Packet> surviving;
@@ -354,7 +354,7 @@ TEST(PacketDecoder, ShuffledDuplicatedMissingAndEmptyPacketsLeaveTheRestAsItIs) 
     if (random() % 10 != 0) surviving.push_back(packet);
   }
   ASSERT_LT(surviving.size(), scan.packets.size());
-  const DecodedScan clean = PacketDecoder({}).decode(surviving, kStart, "velodyne");
+  const DecodedScan clean = PacketDecoder({}).decode(surviving, kUnroundStart, "velodyne");
 
   std::vector<Packet> dirty = surviving;
   std::size_t duplicates = 0;
@@ -372,7 +372,7 @@ TEST(PacketDecoder, ShuffledDuplicatedMissingAndEmptyPacketsLeaveTheRestAsItIs) 
     }
   }
   std::shuffle(dirty.begin(), dirty.end(), random);
-  const DecodedScan decoded = PacketDecoder({}).decode(dirty, kStart, "velodyne");
+  const DecodedScan decoded = PacketDecoder({}).decode(dirty, kUnroundStart, "velodyne");
   EXPECT_EQ(decoded.counters.duplicate_packets, duplicates);
   EXPECT_EQ(decoded.counters.zero_packets, zeros);
   EXPECT_EQ(decoded.counters.packets, dirty.size());
@@ -392,12 +392,12 @@ TEST(PacketDecoder, AStampTellsThePacketsStartMiddleOrEnd) {
       PacketDecoderConfig config;
       config.packet_stamp = stamp;
       config.time_offset_ns = offset;
-      return PacketDecoder(config).decode({packet}, kStart, "velodyne").cloud.time_ns.at(0);
+      return PacketDecoder(config).decode({packet}, kUnroundStart, "velodyne").cloud.time_ns.at(0);
     };
-    EXPECT_EQ(first(PacketStamp::kStart, 0), kStart);
-    EXPECT_EQ(first(PacketStamp::kMiddle, 0), kStart - duration / 2);
-    EXPECT_EQ(first(PacketStamp::kEnd, 0), kStart - duration);
-    EXPECT_EQ(first(PacketStamp::kStart, -12345), kStart - 12345);
+    EXPECT_EQ(first(PacketStamp::kStart, 0), kUnroundStart);
+    EXPECT_EQ(first(PacketStamp::kMiddle, 0), kUnroundStart - duration / 2);
+    EXPECT_EQ(first(PacketStamp::kEnd, 0), kUnroundStart - duration);
+    EXPECT_EQ(first(PacketStamp::kStart, -12345), kUnroundStart - 12345);
   }
 }
 
@@ -410,7 +410,7 @@ TEST(PacketDecoder, RangeLimitsConcernTheMeasuredRange) {
   PacketDecoderConfig config;
   config.min_range_m = 1.0;
   config.max_range_m = 2.0;
-  const DecodedScan scan = PacketDecoder(config).decode({packet}, kStart, "velodyne");
+  const DecodedScan scan = PacketDecoder(config).decode({packet}, kUnroundStart, "velodyne");
   EXPECT_EQ(scan.cloud.intensity, (std::vector<float>{2.0f, 3.0f}));
   EXPECT_EQ(scan.counters.out_of_range_points, 2u);
 }
@@ -419,13 +419,13 @@ TEST(PacketDecoder, VerticalOffsetsGoByRing) {
   Packet packet = vlp16Packet();
   setReturn(packet, 0, 1, 1000, 1);  // ring 8
   PacketDecoderConfig config;
-  const float plain = PacketDecoder(config).decode({packet}, kStart, "v").cloud.z.at(0);
+  const float plain = PacketDecoder(config).decode({packet}, kUnroundStart, "v").cloud.z.at(0);
   for (int ring = 0; ring < 16; ++ring) config.vertical_offsets_m.push_back(0.001 * ring);
-  const float moved = PacketDecoder(config).decode({packet}, kStart, "v").cloud.z.at(0);
+  const float moved = PacketDecoder(config).decode({packet}, kUnroundStart, "v").cloud.z.at(0);
   EXPECT_NEAR(moved - plain, 0.008, 1e-6);
 
   packet.data[1205] = 0x28;
-  const DecodedScan wrong = PacketDecoder(config).decode({packet}, kStart, "v");
+  const DecodedScan wrong = PacketDecoder(config).decode({packet}, kUnroundStart, "v");
   EXPECT_TRUE(wrong.cloud.empty());
   ASSERT_EQ(wrong.counters.unknown_packets.size(), 1u);
   EXPECT_NE(wrong.counters.unknown_packets.begin()->first.find("16 entries"), std::string::npos);
@@ -467,7 +467,7 @@ TEST(PacketDecoder, SurvivesRandomBytes) {
     const std::uint8_t models[] = {0x21, 0x22, 0x24, 0x28, 0xA1};
     packet.data[1204] = modes[random() % 3];
     packet.data[1205] = models[random() % 5];
-    const TimedCloud cloud = PacketDecoder({}).decode({packet}, kStart, "velodyne").cloud;
+    const TimedCloud cloud = PacketDecoder({}).decode({packet}, kUnroundStart, "velodyne").cloud;
     for (std::size_t i = 0; i < cloud.size(); ++i) {
       ASSERT_TRUE(std::isfinite(cloud.x[i]) && std::isfinite(cloud.y[i]) &&
                   std::isfinite(cloud.z[i]));
@@ -540,7 +540,7 @@ TEST(PacketDecoder, AgreesWithAnIndependentDecoderOnARealCapture) {
     Packet packet;
     std::copy_n(bytes.begin() + static_cast<std::ptrdiff_t>(i * kPacketBytes), kPacketBytes,
                 packet.data.begin());
-    packet.stamp = kStart + clockNs(packet);
+    packet.stamp = kUnroundStart + clockNs(packet);
     packets.push_back(packet);
   }
   const DecodedScan scan = PacketDecoder({}).decode(packets, packets[0].stamp, "velodyne");
@@ -626,7 +626,7 @@ std::vector<Packet> packetsOf(const Capture& capture) {
   for (std::size_t i = 0; i < packets.size(); ++i) {
     std::copy_n(bytes.begin() + static_cast<std::ptrdiff_t>(i * kPacketBytes), kPacketBytes,
                 packets[i].data.begin());
-    packets[i].stamp = kStart + clockNs(packets[i]);
+    packets[i].stamp = kUnroundStart + clockNs(packets[i]);
   }
   packets.erase(packets.begin(),
                 packets.begin() + static_cast<std::ptrdiff_t>(capture.first_packet));
@@ -734,18 +734,20 @@ TEST(PacketDecoder, AgreesWithAnIndependentDecoderOnAVls128) {
 struct Stamped {
   Stamped() {
     PacketEncoder::Config config;
-    config.start_ns = kStart;
+    config.start_ns = kUnroundStart;
     config.rotation_hz = exactRotationHz("VLP16", false);
     scan = makeScan(config, 75);
   }
-  DecodedScan decoded() const { return PacketDecoder({}).decode(scan.packets, kStart, "velodyne"); }
+  DecodedScan decoded() const {
+    return PacketDecoder({}).decode(scan.packets, kUnroundStart, "velodyne");
+  }
   Scan scan;
 };
 
 TEST(PacketTimes, PacketsFarFromTheOthersAreDroppedAndCounted) {
   const StampNs ms = 1000000;
   for (const StampNs off : {-3600000 * ms, 3600000 * ms, -1000 * ms, 1000 * ms, -500 * ms, 500 * ms,
-                            -300 * ms, -kStart}) {
+                            -300 * ms, -kUnroundStart}) {
     for (const bool with_clock : {true, false}) {
       for (const std::vector<int>& which :
            {std::vector<int>{40}, {0}, {74}, {3, 17, 31, 66}, {70, 71, 72, 73, 74}}) {
@@ -754,7 +756,7 @@ TEST(PacketTimes, PacketsFarFromTheOthersAreDroppedAndCounted) {
         Stamped stamped;
         std::vector<Point> truth;
         for (const Point& point : stamped.scan.truth) {
-          const auto packet = static_cast<int>((point.time_ns - kStart) / 1327104);
+          const auto packet = static_cast<int>((point.time_ns - kUnroundStart) / 1327104);
           if (std::find(which.begin(), which.end(), packet) == which.end()) truth.push_back(point);
         }
         for (Packet& packet : stamped.scan.packets) {
@@ -772,7 +774,7 @@ TEST(PacketTimes, PacketsFarFromTheOthersAreDroppedAndCounted) {
 
 TEST(PacketTimes, EqualStampsLeaveTheTimesToThePacketsOwnClock) {
   Stamped stamped;
-  for (Packet& packet : stamped.scan.packets) packet.stamp = kStart;
+  for (Packet& packet : stamped.scan.packets) packet.stamp = kUnroundStart;
   std::mt19937 random(3);
   std::shuffle(stamped.scan.packets.begin(), stamped.scan.packets.end(), random);
   const DecodedScan decoded = stamped.decoded();
@@ -825,7 +827,7 @@ TEST(PacketTimes, RoundedAndLateStampsLeaveTheTimesToThePacketsOwnClock) {
 TEST(PacketTimes, TheClockMayPassTheHour) {
   PacketEncoder::Config config;
   const StampNs hour = 3600 * kNsPerSecond;
-  config.start_ns = kStart / hour * hour + hour - 40000000;
+  config.start_ns = kUnroundStart / hour * hour + hour - 40000000;
   Scan scan = makeScan(config, 75);
   for (Packet& packet : scan.packets) packet.stamp = config.start_ns;
   const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, 0, "velodyne");
@@ -845,7 +847,7 @@ TEST_P(EveryModel, NoPointIsTurnedAcrossABlindSector) {
     config.view_begin_deg = begin;
     config.view_end_deg = end;
     const Scan scan = makeScan(config, 400 / 12);
-    const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, kStart, "velodyne");
+    const DecodedScan decoded = PacketDecoder({}).decode(scan.packets, kUnroundStart, "velodyne");
     ASSERT_EQ(decoded.cloud.size(), scan.truth.size());
     for (std::size_t i = 0; i < scan.truth.size(); ++i) {
       // Where the sector began and ended is known to 0.01 deg, 2.5 us.
@@ -859,24 +861,25 @@ TEST_P(EveryModel, NoPointIsTurnedAcrossABlindSector) {
 
 TEST(PacketDecoder, AStandingMotorTurnsNoPoint) {
   PacketEncoder::Config config;
-  config.start_ns = kStart;
+  config.start_ns = kUnroundStart;
   config.rotation_hz = 1e-9;
   config.start_azimuth_deg = 77.0;
   const Scan scan = makeScan(config, 3);
-  expectSame(PacketDecoder({}).decode(scan.packets, kStart, "velodyne").cloud, scan.truth, 1e-9);
+  expectSame(PacketDecoder({}).decode(scan.packets, kUnroundStart, "velodyne").cloud, scan.truth,
+             1e-9);
 }
 
 TEST(PacketDecoder, ADamagedAzimuthMovesNoOtherBlock) {
   PacketEncoder::Config config;
-  config.start_ns = kStart;
+  config.start_ns = kUnroundStart;
   config.rotation_hz = exactRotationHz(config.model, false);
   Scan scan = makeScan(config, 3);
   scan.packets[1].data[100 * 5 + 3] ^= 0x40;  // 163.84 deg
-  const TimedCloud cloud = PacketDecoder({}).decode(scan.packets, kStart, "velodyne").cloud;
+  const TimedCloud cloud = PacketDecoder({}).decode(scan.packets, kUnroundStart, "velodyne").cloud;
   ASSERT_EQ(cloud.size(), scan.truth.size());
   for (std::size_t i = 0; i < cloud.size(); ++i) {
     ASSERT_EQ(cloud.time_ns[i], scan.truth[i].time_ns);
-    if ((cloud.time_ns[i] - kStart) / 110592 == 12 + 5) continue;
+    if ((cloud.time_ns[i] - kUnroundStart) / 110592 == 12 + 5) continue;
     ASSERT_LT(distance(at(cloud, i), scan.truth[i]), 1e-5) << i;
   }
 }
@@ -889,7 +892,8 @@ TEST_P(EveryModel, WithTheModelGivenTheBlocksTellTheReturnMode) {
     for (Packet& packet : scan.packets) packet.data[1204] = packet.data[1205] = blank;
     PacketDecoderConfig decoder;
     decoder.model = findLidarSpec(config.model);
-    const DecodedScan decoded = PacketDecoder(decoder).decode(scan.packets, kStart, "velodyne");
+    const DecodedScan decoded =
+        PacketDecoder(decoder).decode(scan.packets, kUnroundStart, "velodyne");
     EXPECT_TRUE(decoded.counters.unknown_packets.empty());
     expectSame(decoded.cloud, scan.truth, 0.0);
   }
@@ -898,7 +902,7 @@ TEST_P(EveryModel, WithTheModelGivenTheBlocksTellTheReturnMode) {
 TEST(PacketDecoder, AnHdl64eIsRefusedWithTheReason) {
   Packet packet = vlp16Packet(0x48, 0xDC);
   for (int b = 1; b < 12; b += 2) packet.data[100 * b + 1] = 0xDD;
-  const DecodedScan scan = PacketDecoder({}).decode({packet}, kStart, "velodyne");
+  const DecodedScan scan = PacketDecoder({}).decode({packet}, kUnroundStart, "velodyne");
   EXPECT_TRUE(scan.cloud.empty());
   ASSERT_EQ(scan.counters.unknown_packets.size(), 1u);
   EXPECT_NE(scan.counters.unknown_packets.begin()->first.find("HDL-64E"), std::string::npos);

@@ -13,12 +13,11 @@
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/lidar/point_cloud_reader.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
+#include "stamps.h"
 
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
-constexpr StampNs kStart = 1673400472138016708;
 constexpr std::uint8_t kInt8 = 1, kUint8 = 2, kUint16 = 4, kInt32 = 5, kUint32 = 6, kFloat32 = 7,
                        kFloat64 = 8, kUint64 = 10;
 
@@ -29,7 +28,7 @@ struct Message {
 
   Message(std::uint32_t width, std::uint32_t height, std::uint32_t point_step,
           std::uint32_t row_padding = 0) {
-    header.header_stamp = kStart;
+    header.header_stamp = kUnroundStart;
     header.frame_id = "lidar";
     header.width = width;
     header.height = height;
@@ -76,9 +75,9 @@ std::string errorOf(const PointCloudBytes& bytes, const PointCloudReaderConfig& 
 constexpr std::size_t kPoints = 1000;
 constexpr StampNs kStepNs = 100000;
 constexpr StampNs kSpanNs = (kPoints - 1) * kStepNs;
-constexpr StampNs kEnd = kStart + kSpanNs;
+constexpr StampNs kEnd = kUnroundStart + kSpanNs;
 
-/// How one driver writes the time of a point that was measured at kStart + ns.
+/// How one driver writes the time of a point that was measured at kUnroundStart + ns.
 struct Convention {
   std::string name;
   std::string field;
@@ -115,8 +114,8 @@ std::vector<Convention> conventions() {
     return writes<double>([=](StampNs ns) { return static_cast<double>(ns) * per_ns; });
   };
   const auto seconds = writes<double>([](StampNs ns) {
-    return static_cast<double>((kStart + ns) / kNsPerSecond) +
-           static_cast<double>((kStart + ns) % kNsPerSecond) * 1e-9;
+    return static_cast<double>((kUnroundStart + ns) / kNsPerSecond) +
+           static_cast<double>((kUnroundStart + ns) % kNsPerSecond) * 1e-9;
   });
   const auto u32 = writes<std::uint32_t>([](StampNs ns) { return static_cast<std::uint32_t>(ns); });
   const auto u64 = [](StampNs shift, StampNs unit) {
@@ -127,37 +126,41 @@ std::vector<Convention> conventions() {
                  ns = TimeUnit::kNanoseconds;
   const TimeReference stamp = TimeReference::kStamp, absolute = TimeReference::kAbsolute;
   return {
-      {"velodyne, stamp of the first", "time", kFloat32, 1, kStart, f32(1e-9, 0), standard, s,
-       stamp},
+      {"velodyne, stamp of the first", "time", kFloat32, 1, kUnroundStart, f32(1e-9, 0), standard,
+       s, stamp},
       {"velodyne, stamp of the last", "time", kFloat32, 1, kEnd, f32(1e-9, kSpanNs), standard, s,
        stamp},
-      {"float ms", "time", kFloat32, 1, kStart, f32(1e-6, 0), standard, ms, stamp},
-      {"float us", "time", kFloat32, 1, kStart, f32(1e-3, 0), standard, us, stamp},
-      {"float ns", "time", kFloat32, 1, kStart, f32(1.0, 0), standard, ns, stamp},
-      {"ouster", "t", kUint32, 1, kStart, u32, standard, ns, stamp},
-      {"livox offset", "offset_time", kUint32, 1, kStart, u32, standard, ns, stamp},
-      {"hesai", "timestamp", kFloat64, 1, kStart, seconds, standard, s, absolute},
+      {"float ms", "time", kFloat32, 1, kUnroundStart, f32(1e-6, 0), standard, ms, stamp},
+      {"float us", "time", kFloat32, 1, kUnroundStart, f32(1e-3, 0), standard, us, stamp},
+      {"float ns", "time", kFloat32, 1, kUnroundStart, f32(1.0, 0), standard, ns, stamp},
+      {"ouster", "t", kUint32, 1, kUnroundStart, u32, standard, ns, stamp},
+      {"livox offset", "offset_time", kUint32, 1, kUnroundStart, u32, standard, ns, stamp},
+      {"hesai", "timestamp", kFloat64, 1, kUnroundStart, seconds, standard, s, absolute},
       {"hesai, stamp of the last", "timestamp", kFloat64, 1, kEnd, seconds, standard, s, absolute},
-      {"livox, ns in float64", "timestamp", kFloat64, 1, kStart,
-       writes<double>([](StampNs t) { return static_cast<double>(kStart + t); }), standard, ns,
-       absolute},
-      {"float64 s after the stamp", "time", kFloat64, 1, kStart, f64(1e-9), standard, s, stamp},
-      {"float64 ns after the stamp", "time", kFloat64, 1, kStart, f64(1.0), standard, ns, stamp},
-      {"uint64 ns", "time_stamp", kUint64, 1, kStart, u64(kStart, 1), standard, ns, absolute},
-      {"uint64 us", "time_stamp", kUint64, 1, kStart, u64(kStart, 1000), standard, us, absolute},
-      {"uint64 ns after the stamp", "time_stamp", kUint64, 1, kStart, u64(0, 1), standard, ns,
+      {"livox, ns in float64", "timestamp", kFloat64, 1, kUnroundStart,
+       writes<double>([](StampNs t) { return static_cast<double>(kUnroundStart + t); }), standard,
+       ns, absolute},
+      {"float64 s after the stamp", "time", kFloat64, 1, kUnroundStart, f64(1e-9), standard, s,
        stamp},
-      {"uint64 as two uint32", "timestamp", kUint32, 2, kStart, u64(kStart, 1), standard, ns,
+      {"float64 ns after the stamp", "time", kFloat64, 1, kUnroundStart, f64(1.0), standard, ns,
+       stamp},
+      {"uint64 ns", "time_stamp", kUint64, 1, kUnroundStart, u64(kUnroundStart, 1), standard, ns,
        absolute},
-      {"uint64 called float64", "timestamp", kFloat64, 1, kStart, u64(kStart, 1), standard, ns,
+      {"uint64 us", "time_stamp", kUint64, 1, kUnroundStart, u64(kUnroundStart, 1000), standard, us,
        absolute},
+      {"uint64 ns after the stamp", "time_stamp", kUint64, 1, kUnroundStart, u64(0, 1), standard,
+       ns, stamp},
+      {"uint64 as two uint32", "timestamp", kUint32, 2, kUnroundStart, u64(kUnroundStart, 1),
+       standard, ns, absolute},
+      {"uint64 called float64", "timestamp", kFloat64, 1, kUnroundStart, u64(kUnroundStart, 1),
+       standard, ns, absolute},
       {"scan end by configuration", "t", kUint32, 1, kEnd, u32, scan_end, ns,
        TimeReference::kScanEnd},
-      {"sensor's offset", "t", kUint32, 1, kStart + 7000000, u32, offset, ns, stamp},
-      {"named field and unit", "when", kInt32, 1, kStart,
+      {"sensor's offset", "t", kUint32, 1, kUnroundStart + 7000000, u32, offset, ns, stamp},
+      {"named field and unit", "when", kInt32, 1, kUnroundStart,
        writes<std::int32_t>([](StampNs t) { return static_cast<std::int32_t>(t / 1000); }), named,
        us, stamp},
-      {"another clock", "timestamp", kFloat64, 1, kStart,
+      {"another clock", "timestamp", kFloat64, 1, kUnroundStart,
        writes<double>([](StampNs t) { return 5234.5 + static_cast<double>(t) * 1e-9; }), standard,
        s, stamp},
   };
@@ -166,7 +169,7 @@ std::vector<Convention> conventions() {
 /// 15 m/s and 30 deg/s.
 Transform pose(StampNs t) {
   const double w = kPi / 6.0;
-  const double angle = w * toSeconds(t - kStart);
+  const double angle = w * toSeconds(t - kUnroundStart);
   Transform T = Transform::Identity();
   T.linear() = Eigen::AngleAxisd(angle, Eigen::Vector3d::UnitZ()).toRotationMatrix();
   T.translation() =
@@ -176,10 +179,10 @@ Transform pose(StampNs t) {
 
 TEST(PointCloudReader, EveryTimeConventionGivesTheSamePoints) {
   PoseBuffer odometry;
-  for (StampNs t = kStart - 50000000; t <= kStart + 200000000; t += 10000000) {
+  for (StampNs t = kUnroundStart - 50000000; t <= kUnroundStart + 200000000; t += 10000000) {
     odometry.add({t, pose(t)});
   }
-  const StampNs reference = kStart + 40000000;
+  const StampNs reference = kUnroundStart + 40000000;
   for (const Convention& convention : conventions()) {
     SCOPED_TRACE(convention.name);
     Message message(kPoints, 1, 24);
@@ -207,7 +210,7 @@ TEST(PointCloudReader, EveryTimeConventionGivesTheSamePoints) {
             .cloud;
     double largest = 0.0;
     for (std::size_t i = 0; i < kPoints; ++i) {
-      const StampNs t = kStart + static_cast<StampNs>(i) * kStepNs;
+      const StampNs t = kUnroundStart + static_cast<StampNs>(i) * kStepNs;
       // The same odometry, so that its own error (0.1 mm) does not count here.
       const Eigen::Vector3d expected =
           odometry.lookup(reference)->inverse() * *odometry.lookup(t) *
@@ -265,14 +268,14 @@ TEST(PointCloudReader, ADayFromTheStampIsNotAbsolute) {
   for (const double days : {0.9, 1.1}) {
     Message message(2, 1, 24);
     message.xyz().field("timestamp", 16, kFloat64);
-    const double base = static_cast<double>(kStart) * 1e-9 + days * 86400.0;
+    const double base = static_cast<double>(kUnroundStart) * 1e-9 + days * 86400.0;
     message.set<double>(0, 16, base);
     message.set<double>(1, 16, base + 0.1);
     const ReadCloud read = PointCloudReader({}).read(message.view());
     EXPECT_EQ(read.time.reference, days < 1.0 ? TimeReference::kAbsolute : TimeReference::kStamp);
     EXPECT_NEAR(toSeconds(read.cloud.time_ns.at(1) - read.cloud.time_ns.at(0)), 0.1, 1e-6);
-    EXPECT_NEAR(toSeconds(read.cloud.time_ns.at(0) - kStart), days < 1.0 ? days * 86400.0 : 0.0,
-                1e-6);
+    EXPECT_NEAR(toSeconds(read.cloud.time_ns.at(0) - kUnroundStart),
+                days < 1.0 ? days * 86400.0 : 0.0, 1e-6);
   }
 }
 
@@ -285,17 +288,17 @@ TEST(PointCloudReader, EqualTimesAreAnInstantWithAWarning) {
   EXPECT_TRUE(read.time.warning);
   EXPECT_NE(read.time.text.find("instant"), std::string::npos);
   EXPECT_EQ(read.cloud.firings.size(), 1u);
-  EXPECT_EQ(read.cloud.time_ns, std::vector<StampNs>(5, kStart));
+  EXPECT_EQ(read.cloud.time_ns, std::vector<StampNs>(5, kUnroundStart));
 }
 
 /// The clouds of a convention with the raw times of some points replaced by those of
-/// kStart + ns: what comes out must be as without them.
+/// kUnroundStart + ns: what comes out must be as without them.
 TEST(PointCloudReader, AFewWrongTimesChangeNothingForTheOthers) {
   const StampNs s = kNsPerSecond;
   for (const Convention& c : conventions()) {
     for (const StampNs wrong :
          std::vector<StampNs>{3604361924, 2 * s, 500 * s / 1000, 300 * s / 1000, -2 * s, -s / 2,
-                              3600 * s, -3600 * s, -kStart}) {
+                              3600 * s, -3600 * s, -kUnroundStart}) {
       for (const std::vector<std::size_t>& which :
            {std::vector<std::size_t>{0}, {500}, {kPoints - 1}, {3, 4, 5, 400, 401, 700, 999}}) {
         // What the type cannot tell is no case: before the stamp, unsigned; after 4.29 s; float ms.
@@ -383,14 +386,14 @@ TEST(PointCloudReader, WithoutATimeFieldTheConfigurationDecides) {
   config.time_offset_ns = 1000;
   ReadCloud read = PointCloudReader(config).read(message.view());
   EXPECT_TRUE(read.time.instant && read.time.warning);
-  EXPECT_EQ(read.cloud.time_ns, std::vector<StampNs>(8, kStart + 1000));
+  EXPECT_EQ(read.cloud.time_ns, std::vector<StampNs>(8, kUnroundStart + 1000));
 
   config.without_time = WithoutTime::kAzimuth;
   read = PointCloudReader(config).read(message.view());
   EXPECT_TRUE(read.time.warning);
   EXPECT_FALSE(read.time.instant);
   for (std::size_t i = 0; i < 8; ++i) {
-    EXPECT_NEAR(static_cast<double>(read.cloud.time_ns[i] - kStart - 1000),
+    EXPECT_NEAR(static_cast<double>(read.cloud.time_ns[i] - kUnroundStart - 1000),
                 12500000.0 * static_cast<double>(i), 50.0);
   }
 
@@ -417,7 +420,7 @@ TEST(PointCloudReader, TheAzimuthModelKnowsBothDirectionsAndRingByRingOrder) {
       config.without_time = WithoutTime::kAzimuth;
       const ReadCloud read = PointCloudReader(config).read(message.view());
       for (std::size_t i = 0; i < expected_ns.size(); ++i) {
-        double ns = static_cast<double>(read.cloud.time_ns[i] - kStart);
+        double ns = static_cast<double>(read.cloud.time_ns[i] - kUnroundStart);
         if (ring_by_ring && ns > 99.9e6) ns -= 1e8;  // the seam itself, by rounding of float
         ASSERT_NEAR(ns, expected_ns[i], 100.0) << sign << ring_by_ring << " " << i;
       }
@@ -455,7 +458,7 @@ TEST(PointCloudReader, ReadsEveryTypeOfFieldInOrganisedCloudsWithPadding) {
     }
     const TimedCloud cloud = PointCloudReader({}).read(message.view()).cloud;
     EXPECT_EQ(cloud.frame_id, "lidar");
-    EXPECT_EQ(cloud.header_stamp, kStart);
+    EXPECT_EQ(cloud.header_stamp, kUnroundStart);
     EXPECT_EQ(cloud.x, (std::vector<float>{1, 2, 3, 4, 5, 6}));
     EXPECT_EQ(cloud.y, (std::vector<float>{2, 3, 4, 5, 6, 7}));
     EXPECT_EQ(cloud.z, (std::vector<float>{3, 4, 5, 6, 7, 8}));
@@ -463,8 +466,8 @@ TEST(PointCloudReader, ReadsEveryTypeOfFieldInOrganisedCloudsWithPadding) {
     EXPECT_EQ(cloud.ring, (std::vector<std::uint16_t>{10, 11, 12, 13, 14, 15}));
     EXPECT_EQ(cloud.firing, (std::vector<std::uint32_t>{0, 1, 2, 0, 1, 2}));
     ASSERT_EQ(cloud.firings.size(), 3u);
-    EXPECT_EQ(cloud.firings[2].begin_ns, kStart + 2000);
-    EXPECT_EQ(cloud.firings[2].end_ns, kStart + 2000);
+    EXPECT_EQ(cloud.firings[2].begin_ns, kUnroundStart + 2000);
+    EXPECT_EQ(cloud.firings[2].end_ns, kUnroundStart + 2000);
     EXPECT_EQ(cloud.firings[2].packet, 2u);
   }
 }
@@ -591,7 +594,7 @@ TEST(PointCloudReader, AnEmptyCloudIsEmpty) {
   Message message(0, 1, 12);
   const ReadCloud read = PointCloudReader({}).read(message.view());
   EXPECT_TRUE(read.cloud.empty());
-  EXPECT_EQ(read.cloud.header_stamp, kStart);
+  EXPECT_EQ(read.cloud.header_stamp, kUnroundStart);
   EXPECT_EQ(read.cloud.frame_id, "lidar");
 }
 

@@ -10,12 +10,11 @@
 
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/motion/compensation.h"
+#include "stamps.h"
 
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
-constexpr StampNs kStart = 1673400472138016708;
 constexpr StampNs kFiringNs = 55296;
 constexpr StampNs kLaserNs = 2304;
 constexpr int kFiringsPerPacket = 24;
@@ -30,7 +29,7 @@ Motion constantTwist(const Eigen::Vector3d& origin = Eigen::Vector3d::Zero()) {
   return [origin](StampNs t) {
     const double v = 15.0;
     const double w = 30.0 * kPi / 180.0;
-    const double angle = w * toSeconds(t - kStart);
+    const double angle = w * toSeconds(t - kUnroundStart);
     Transform T = Transform::Identity();
     T.linear() = Eigen::AngleAxisd(angle, Eigen::Vector3d::UnitZ()).toRotationMatrix();
     T.translation() =
@@ -59,7 +58,7 @@ PoseBuffer odometryOf(const Motion& motion, StampNs begin, StampNs end) {
 struct Drive {
   TimedCloud scan;
   std::vector<Eigen::Vector3d> truth;
-  StampNs reference = kStart + 50000123;
+  StampNs reference = kUnroundStart + 50000123;
 };
 
 Drive makeDrive(const Motion& motion, const Transform& T_vehicle_lidar, double max_range_m = 50.0) {
@@ -67,16 +66,16 @@ Drive makeDrive(const Motion& motion, const Transform& T_vehicle_lidar, double m
   std::uniform_real_distribution<double> range(1.0, max_range_m);
   Drive drive;
   drive.scan.frame_id = "velodyne";
-  drive.scan.header_stamp = kStart + 123;
+  drive.scan.header_stamp = kUnroundStart + 123;
   const Transform T_ref_fixed = (motion(drive.reference) * T_vehicle_lidar).inverse();
   for (int packet = 0; packet < kPackets; ++packet) {
     for (int k = 0; k < kFiringsPerPacket; ++k) {
-      const StampNs begin = kStart + (packet * kFiringsPerPacket + k) * kFiringNs;
+      const StampNs begin = kUnroundStart + (packet * kFiringsPerPacket + k) * kFiringNs;
       drive.scan.firings.push_back(
           {begin, begin + (kLasers - 1) * kLaserNs, static_cast<std::uint32_t>(packet)});
       for (int laser = 0; laser < kLasers; ++laser) {
         const StampNs time = begin + laser * kLaserNs;
-        const double azimuth = 2.0 * kPi * 10.0 * toSeconds(time - kStart);
+        const double azimuth = 2.0 * kPi * 10.0 * toSeconds(time - kUnroundStart);
         const double elevation = (-15.0 + 2.0 * laser) * kPi / 180.0;
         const double d = range(random);
         const Eigen::Vector3f measured(
@@ -110,8 +109,8 @@ double largestError(const Cloud& cloud, const std::vector<Eigen::Vector3d>& trut
   return largest;
 }
 
-const StampNs kBefore = kStart - 23000000;
-const StampNs kAfter = kStart + 147000000;
+const StampNs kBefore = kUnroundStart - 23000000;
+const StampNs kAfter = kUnroundStart + 147000000;
 
 TEST(Compensation, ConstantTwistIsCorrectedToHalfAMillimetre) {
   // Between 100 Hz readings the circle's chord departs from the arc by
@@ -260,7 +259,7 @@ TEST(Compensation, KeepsEveryAttributeAndTellsWhenEachPointWasMeasured) {
                           .cloud;
   EXPECT_EQ(cloud.frame_id, "velodyne");
   EXPECT_EQ(cloud.stamp, drive.reference);
-  EXPECT_EQ(cloud.first_point_ns, kStart);
+  EXPECT_EQ(cloud.first_point_ns, kUnroundStart);
   EXPECT_EQ(cloud.intensity, drive.scan.intensity);
   EXPECT_EQ(cloud.ring, drive.scan.ring);
   for (std::size_t i = 0; i < cloud.size(); ++i) {
@@ -317,8 +316,8 @@ TEST(Compensation, WithoutThePoseAtTheReferenceEveryPointIsMarked) {
 struct PartlyCovered : ::testing::Test {
   Motion motion = constantTwist();
   Drive drive = makeDrive(motion, lidarOnVehicle());
-  StampNs first_reading = kStart + 35000000;
-  StampNs last_reading = kStart + 85000000;
+  StampNs first_reading = kUnroundStart + 35000000;
+  StampNs last_reading = kUnroundStart + 85000000;
   PoseBuffer odometry = odometryOf(motion, first_reading, last_reading);
 
   CompensationResult run(OnMissingOdometry mode, StampNs max_extrapolation_ns = 100000000) {
@@ -368,7 +367,7 @@ TEST_F(PartlyCovered, DropTakesThemOutAndKeepsTheOrder) {
     ASSERT_EQ(result.cloud.status[k], 0);
     ++k;
   }
-  EXPECT_EQ(result.cloud.first_point_ns, kStart) << "the key of the scan stays";
+  EXPECT_EQ(result.cloud.first_point_ns, kUnroundStart) << "the key of the scan stays";
 }
 
 TEST_F(PartlyCovered, WithoutThePoseAtTheReferenceNoneIsDropped) {
@@ -433,9 +432,9 @@ TEST(Compensation, ExtrapolationFollowsAScrewInSpace) {
   };
   const Transform start = lidarOnVehicle();
   PoseBuffer odometry;
-  odometry.add({kStart, start});
-  odometry.add({kStart + 1000, start * screw(1.0)});
-  for (const StampNs t : {kStart + 1500, kStart - 500}) {
+  odometry.add({kUnroundStart, start});
+  odometry.add({kUnroundStart + 1000, start * screw(1.0)});
+  for (const StampNs t : {kUnroundStart + 1500, kUnroundStart - 500}) {
     TimedCloud scan;
     scan.x = {3.0f};
     scan.y = {-4.0f};
@@ -447,9 +446,10 @@ TEST(Compensation, ExtrapolationFollowsAScrewInSpace) {
     scan.firings = {{t, t, 0}};
     CompensationConfig config;
     config.on_missing = OnMissingOdometry::kExtrapolate;
-    const Cloud cloud = compensate(scan, kStart, odometry, Transform::Identity(), config).cloud;
+    const Cloud cloud =
+        compensate(scan, kUnroundStart, odometry, Transform::Identity(), config).cloud;
     const Eigen::Vector3d expected =
-        screw(static_cast<double>(t - kStart) / 1000.0) * Eigen::Vector3d(3.0, -4.0, 1.0);
+        screw(static_cast<double>(t - kUnroundStart) / 1000.0) * Eigen::Vector3d(3.0, -4.0, 1.0);
     EXPECT_LT((at(cloud, 0) - expected).norm(), 1e-5);
   }
 }
@@ -458,16 +458,17 @@ TEST(Compensation, OneReadingServesItsOwnInstantOnly) {
   const Motion motion = constantTwist();
   Drive drive = makeDrive(motion, lidarOnVehicle());
   PoseBuffer odometry;
-  odometry.add({kStart, motion(kStart)});
+  odometry.add({kUnroundStart, motion(kUnroundStart)});
   CompensationConfig config;
   config.on_missing = OnMissingOdometry::kExtrapolate;
   const CompensationResult result =
-      compensate(drive.scan, kStart, odometry, lidarOnVehicle(), config);
+      compensate(drive.scan, kUnroundStart, odometry, lidarOnVehicle(), config);
   EXPECT_TRUE(result.counters.reference_covered);
   EXPECT_EQ(result.counters.marked_points, drive.scan.size()) << "two readings make a twist";
 
   config.on_missing = OnMissingOdometry::kHold;
-  const Cloud held = compensate(drive.scan, kStart, odometry, lidarOnVehicle(), config).cloud;
+  const Cloud held =
+      compensate(drive.scan, kUnroundStart, odometry, lidarOnVehicle(), config).cloud;
   for (std::size_t i = 0; i < held.size(); ++i) {
     ASSERT_LT(
         (at(held, i) - Eigen::Vector3d(drive.scan.x[i], drive.scan.y[i], drive.scan.z[i])).norm(),
@@ -478,7 +479,7 @@ TEST(Compensation, OneReadingServesItsOwnInstantOnly) {
 TEST(Compensation, AnInstantIsAScanToo) {
   const Motion motion = constantTwist();
   Drive drive = makeDrive(motion, lidarOnVehicle());
-  const StampNs t = kStart + 20000000;
+  const StampNs t = kUnroundStart + 20000000;
   for (StampNs& time : drive.scan.time_ns) time = t;
   std::fill(drive.scan.firing.begin(), drive.scan.firing.end(), 0u);
   drive.scan.firings = {{t, t, 0}};
@@ -497,15 +498,15 @@ TEST(Compensation, AnInstantIsAScanToo) {
 TEST(VehicleMotion, IsTheTransformBetweenTwoTimesAlsoInMapCoordinates) {
   const Motion motion = constantTwist(Eigen::Vector3d(331275.0, 6250099.0, 41.0));
   const Motion near = constantTwist();
-  const PoseBuffer odometry = odometryOf(motion, kStart, kAfter);
-  const StampNs from = kStart + 2 * kReadingNs;
-  const StampNs to = kStart + 7 * kReadingNs;
+  const PoseBuffer odometry = odometryOf(motion, kUnroundStart, kAfter);
+  const StampNs from = kUnroundStart + 2 * kReadingNs;
+  const StampNs to = kUnroundStart + 7 * kReadingNs;
   const auto T_to_from = vehicleMotion(odometry, from, to);
   ASSERT_TRUE(T_to_from);
   const Transform expected = near(to).inverse() * near(from);
   EXPECT_LT((T_to_from->matrix() - expected.matrix()).cwiseAbs().maxCoeff(), 2e-9);
   EXPECT_FALSE(vehicleMotion(odometry, from, kAfter + kNsPerSecond));
-  EXPECT_FALSE(vehicleMotion(odometry, kStart - 1, to));
+  EXPECT_FALSE(vehicleMotion(odometry, kUnroundStart - 1, to));
 }
 
 TEST_F(PartlyCovered, HoldAndExtrapolateReachTheReferenceAndTheImageToo) {
@@ -526,7 +527,7 @@ TEST_F(PartlyCovered, HoldAndExtrapolateReachTheReferenceAndTheImageToo) {
   EXPECT_FALSE(run(OnMissingOdometry::kExtrapolate, 500000).counters.reference_covered);
 
   CompensationConfig config;
-  const StampNs from = kStart + 50000000;
+  const StampNs from = kUnroundStart + 50000000;
   EXPECT_FALSE(vehicleMotion(odometry, from, behind, config));
   config.on_missing = OnMissingOdometry::kExtrapolate;
   const auto moved = vehicleMotion(odometry, from, behind, config);
@@ -547,7 +548,7 @@ TEST(Compensation, APacketHasThePoseOfItsFirstFiringWhateverReturned) {
   const Motion motion = constantTwist();
   Drive drive = makeDrive(motion, lidarOnVehicle());
   for (int p = 0; p < kPackets; ++p) {
-    drive.scan.packet_begin_ns.push_back(kStart + p * kFiringsPerPacket * kFiringNs);
+    drive.scan.packet_begin_ns.push_back(kUnroundStart + p * kFiringsPerPacket * kFiringNs);
   }
   const PoseBuffer odometry = odometryOf(motion, kBefore, kAfter);
   CompensationConfig config;

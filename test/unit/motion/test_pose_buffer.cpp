@@ -12,8 +12,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
-
 Transform pose(double x, double yaw_rad) {
   Transform T = Transform::Identity();
   T.linear() = Eigen::AngleAxisd(yaw_rad, Eigen::Vector3d::UnitZ()).toRotationMatrix();

@@ -9,14 +9,12 @@
 #include <random>
 #include <vector>
 
+#include "not_finite.h"
 #include "projection/mask_kernels.h"
 #include "semantic_lidar_fusion/camera/camera_model.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr float kInfinity = std::numeric_limits<float>::infinity();
-constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
 
 CameraModel camera(double max_theta_deg) {
   CameraInfo info;

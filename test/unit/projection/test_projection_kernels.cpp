@@ -8,13 +8,11 @@
 #include <random>
 #include <vector>
 
+#include "not_finite.h"
 #include "projection/projection_kernels.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr float kInfinity = std::numeric_limits<float>::infinity();
-constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
 
 /// Points in arrays of exactly their length, so that a sanitizer sees each read beyond them.
 struct Points {

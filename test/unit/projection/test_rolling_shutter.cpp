@@ -13,9 +13,7 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr double kPi = 3.14159265358979323846;
-
-CameraInfo fisheyeInfo() {
+CameraInfo sideCameraInfo() {
   CameraInfo info;
   info.frame_id = "camera";
   info.size = {1928, 1208};
@@ -95,7 +93,7 @@ std::vector<Eigen::Vector3d> street(int count, double nearest_m, std::uint32_t s
 }
 
 TEST(RollingShutter, RowTimesFollowDirectionStampAndReduction) {
-  CameraInfo info = fisheyeInfo();
+  CameraInfo info = sideCameraInfo();
   const double line_s = 0.012 / 1208;
   const auto times = [&](ShutterDirection direction, StampRow row) {
     return CameraModel(info, shutter(0.012, direction, row)).rowTimes();
@@ -125,7 +123,7 @@ TEST(RollingShutter, PixelsAreThoseOfTheRowsOwnTime) {
   for (const ShutterDirection direction : {ShutterDirection::kDown, ShutterDirection::kUp,
                                            ShutterDirection::kRight, ShutterDirection::kLeft}) {
     for (const StampRow row : {StampRow::kFirst, StampRow::kMiddle, StampRow::kLast}) {
-      const CameraModel camera(fisheyeInfo(), shutter(0.03, direction, row));
+      const CameraModel camera(sideCameraInfo(), shutter(0.03, direction, row));
       const Twist twist = drive();
       int compared = 0;
       double worst = 0.0, ignored = 0.0;
@@ -149,13 +147,13 @@ TEST(RollingShutter, PixelsAreThoseOfTheRowsOwnTime) {
 
 TEST(RollingShutter, AWrongDirectionOrStampRowIsVisiblyWorse) {
   const Twist twist = drive();
-  const CameraModel right(fisheyeInfo(), shutter(0.02));
+  const CameraModel right(sideCameraInfo(), shutter(0.02));
   for (const CameraModelOptions& wrong :
        {shutter(0.02, ShutterDirection::kUp), shutter(0.02, ShutterDirection::kRight),
         shutter(0.02, ShutterDirection::kLeft),
         shutter(0.02, ShutterDirection::kDown, StampRow::kMiddle),
         shutter(0.02, ShutterDirection::kDown, StampRow::kLast)}) {
-    const CameraModel camera(fisheyeInfo(), wrong);
+    const CameraModel camera(sideCameraInfo(), wrong);
     double worst = 0.0;
     for (const Eigen::Vector3d& p : street(300, 5.0, 6)) {
       const auto a = seePoint(right, &twist, p), b = seePoint(camera, &twist, p);
@@ -177,13 +175,13 @@ TEST(RollingShutter, CloudsGetThePixelsOfSinglePoints) {
   points.push_back(T_camera_lidar.inverse(Eigen::Isometry) * Eigen::Vector3d(0, 0, 5));
   points.push_back({std::nan(""), 0, 1});
   const Cloud cloud = cloudOf(points);
-  CameraInfo pinhole = fisheyeInfo();
+  CameraInfo pinhole = sideCameraInfo();
   pinhole.distortion_model = "";
   pinhole.d.clear();
-  CameraInfo folding = fisheyeInfo();  // at 91 deg, in the image with this focal length
+  CameraInfo folding = sideCameraInfo();  // at 91 deg, in the image with this focal length
   folding.d = {-0.05, -0.02, 0.01, -0.003};
   folding.k[0] = folding.k[4] = 400.0;
-  for (const CameraInfo& info : {fisheyeInfo(), pinhole, folding}) {
+  for (const CameraInfo& info : {sideCameraInfo(), pinhole, folding}) {
     const CameraModel camera(info, shutter(0.03, ShutterDirection::kUp, StampRow::kMiddle));
     const auto projected = projectCloud(cloud, T_camera_lidar, camera, 30.0, &twist);
     std::vector<int> slot(points.size(), -1);
@@ -228,14 +226,14 @@ TEST(RollingShutter, WithoutMotionOrReadoutNothingChanges) {
   const Cloud cloud = cloudOf(street(3000, 1.0, 8));
   const Twist twist = drive(), still;
   const auto plain =
-      projectCloud(cloud, Transform::Identity(), CameraModel(fisheyeInfo(), {}), 5.0);
+      projectCloud(cloud, Transform::Identity(), CameraModel(sideCameraInfo(), {}), 5.0);
   const auto same = [&](const ProjectedPoints& other) {
     return other.index == plain.index && other.u == plain.u && other.v == plain.v &&
            other.distance == plain.distance && other.theta == plain.theta;
   };
-  const CameraModel rolling(fisheyeInfo(), shutter(0.03));
+  const CameraModel rolling(sideCameraInfo(), shutter(0.03));
   EXPECT_TRUE(same(
-      projectCloud(cloud, Transform::Identity(), CameraModel(fisheyeInfo(), {}), 5.0, &twist)));
+      projectCloud(cloud, Transform::Identity(), CameraModel(sideCameraInfo(), {}), 5.0, &twist)));
   EXPECT_TRUE(same(projectCloud(cloud, Transform::Identity(), rolling, 5.0)));
   EXPECT_TRUE(same(projectCloud(cloud, Transform::Identity(), rolling, 5.0, &still)));
   EXPECT_FALSE(same(projectCloud(cloud, Transform::Identity(), rolling, 5.0, &twist)));
@@ -246,7 +244,7 @@ TEST(RollingShutter, APointThatLeavesTheDomainInAnyRoundHasNoPixel) {
   // outside at its row's, and the other way round.
   CameraModelOptions options = shutter(0.03, ShutterDirection::kRight);
   options.max_theta_deg = 60.0;
-  const CameraModel camera(fisheyeInfo(), options);
+  const CameraModel camera(sideCameraInfo(), options);
   const Twist turning{{0, 0, 0}, {0, -1.0, 0}};
   int inside_first = 0, outside_first = 0;
   for (double deg = 55.0; deg < 65.0; deg += 0.01) {
@@ -270,7 +268,7 @@ TEST(RollingShutter, APointThatLeavesTheDomainInAnyRoundHasNoPixel) {
 TEST(RollingShutter, MasksAreCastWhereTheRowsSawTheSurface) {
   // A near pole before a wall, both seen by a camera that moves: the pole hides the wall where its
   // own rows saw it. With the shutter ignored by the mask the two would differ by 20 px.
-  const CameraModel camera(fisheyeInfo(), shutter(0.03));
+  const CameraModel camera(sideCameraInfo(), shutter(0.03));
   const Twist twist{{15.0, 0.0, 0.0}, {0, 0, 0}};
   std::vector<Eigen::Vector3d> points;
   std::vector<std::uint16_t> rings;

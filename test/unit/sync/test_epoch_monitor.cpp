@@ -7,12 +7,10 @@
 #include <vector>
 
 #include "semantic_lidar_fusion/sync/epoch_monitor.h"
+#include "stamps.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr StampNs kMs = 1000000;
-constexpr StampNs kStart = 1500000000 * kNsPerSecond;
 
 /// What a monitor let through, in order.
 struct Seen {

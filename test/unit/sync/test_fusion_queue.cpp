@@ -2,12 +2,10 @@
 #include <gtest/gtest.h>
 
 #include "semantic_lidar_fusion/sync/fusion_queue.h"
+#include "stamps.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr StampNs kMs = 1000000;
-constexpr StampNs kStart = 1500000000 * kNsPerSecond;
 
 std::shared_ptr<Cloud> cloudAt(StampNs first_ns, StampNs reference_ns) {
   auto cloud = std::make_shared<Cloud>();

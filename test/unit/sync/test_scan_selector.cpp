@@ -11,13 +11,10 @@
 
 #include "semantic_lidar_fusion/common/error.h"
 #include "semantic_lidar_fusion/sync/scan_selector.h"
+#include "stamps.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr StampNs kMs = 1000000;
-/// A stamp of our days: sums of such stamps would overflow, differences must not.
-constexpr StampNs kStart = 1700000000 * kNsPerSecond;
 
 SelectorConfig cameras(std::size_t count) {
   SelectorConfig config;

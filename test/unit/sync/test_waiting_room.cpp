@@ -2,12 +2,10 @@
 #include <gtest/gtest.h>
 
 #include "semantic_lidar_fusion/sync/waiting_room.h"
+#include "stamps.h"
 
 namespace semantic_lidar_fusion {
 namespace {
-
-constexpr StampNs kMs = 1000000;
-constexpr StampNs kStart = 1500000000 * kNsPerSecond;
 
 TEST(WaitingRoom, AsManyScansMayWaitAsComeInTheWait) {
   EXPECT_EQ(scansThatWait(0), 4u);
