@@ -16,6 +16,13 @@
 namespace semantic_lidar_fusion {
 namespace {
 
+/// A call of its own: inlined, gcc 14 takes the vectors of a new message for empty after resize().
+template <class M>
+__attribute__((noinline)) void read(std::vector<std::uint8_t>* bytes, M* message) {
+  ros::serialization::IStream in(bytes->data(), static_cast<std::uint32_t>(bytes->size()));
+  ros::serialization::deserialize(in, *message);
+}
+
 /// Whole messages pass, every one that ends early does not, and no length that lies is believed:
 /// what passes is deserialised within the bytes that are there.
 template <class M>
@@ -41,9 +48,8 @@ void check(const M& message) {
       EXPECT_NE(std::string(error.what()).find("is shorter than a " + type), std::string::npos);
       continue;
     }
-    M read;
-    ros::serialization::IStream in(lying.data(), size);
-    EXPECT_NO_THROW(ros::serialization::deserialize(in, read)) << type << " at " << at;
+    M message_read;
+    EXPECT_NO_THROW(read(&lying, &message_read)) << type << " at " << at;
   }
   EXPECT_GT(refused, 0) << type;
 }
