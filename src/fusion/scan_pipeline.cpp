@@ -212,41 +212,31 @@ CameraView ScanPipeline::view(std::size_t index, const CameraPlace& place,
   view.semantics = image->semantics;
   view.lidar_rows = lidarRows(index, *image);
   view.has_image = true;
-  view.errors = errorsOf(index, place, view.image_ns, reference_ns, odometry, T_vehicle_lidar);
+  const CameraErrors& errors = rig_.cameras[index].errors;
   const bool rolling = place.model->rollingShutter();
+  const bool moving = rig_.motion_enabled && T_vehicle_lidar;
+  std::optional<ViewMotion> motion;
+  if (moving && (rolling || statesErrors(rig_.errors, errors))) {
+    if (const std::optional<Twist> twist = odometry.twist(view.image_ns)) {
+      motion = {place.T_camera_lidar * T_vehicle_lidar->inverse(Eigen::Isometry), *T_vehicle_lidar,
+                *twist};
+    }
+  }
+  view.errors = viewErrors(rig_.errors, errors, motion, toSeconds(view.image_ns - reference_ns));
   if (!rig_.motion_enabled || (view.image_ns == reference_ns && !rolling)) return view;
 
   const std::optional<Transform> T_vehicle_image_vehicle_reference =
       vehicleMotion(odometry, reference_ns, view.image_ns, rig_.compensationConfig());
-  if (!T_vehicle_lidar || !T_vehicle_image_vehicle_reference) {
+  if (!moving || !T_vehicle_image_vehicle_reference) {
     view.has_image = false;
     return view;
   }
+  if (rolling && motion) view.motion = twistOf(motion->T_camera_vehicle, motion->vehicle);
+  if (view.image_ns == reference_ns) return view;
   const Transform T_camera_vehicle =
       place.T_camera_lidar * T_vehicle_lidar->inverse(Eigen::Isometry);
-  if (rolling) {
-    const std::optional<Twist> vehicle_twist = odometry.twist(view.image_ns);
-    if (vehicle_twist) view.motion = twistOf(T_camera_vehicle, *vehicle_twist);
-  }
-  if (view.image_ns == reference_ns) return view;
   view.T_camera_lidar = T_camera_vehicle * *T_vehicle_image_vehicle_reference * *T_vehicle_lidar;
   return view;
-}
-
-ViewErrors ScanPipeline::errorsOf(std::size_t index, const CameraPlace& place, StampNs image_ns,
-                                  StampNs reference_ns, const PoseBuffer& odometry,
-                                  const std::optional<Transform>& T_vehicle_lidar) const {
-  std::optional<ViewMotion> motion;
-  if (rig_.motion_enabled && T_vehicle_lidar) {
-    if (const std::optional<Twist> twist = odometry.twist(image_ns)) {
-      motion.emplace();
-      motion->T_camera_vehicle = place.T_camera_lidar * T_vehicle_lidar->inverse(Eigen::Isometry);
-      motion->T_vehicle_lidar = *T_vehicle_lidar;
-      motion->vehicle = *twist;
-    }
-  }
-  return viewErrors(rig_.errors, rig_.cameras[index].errors, motion,
-                    toSeconds(image_ns - reference_ns));
 }
 
 // --- Occlusion, transfer, merging (eq. 12-14)

@@ -17,6 +17,10 @@ namespace {
 constexpr double kConeSlack = 1e-5;
 /// Angles this close to the limit are judged in double precision.
 constexpr double kThetaSlack_rad = 2e-6;
+/// The same where the transform is in single precision too, for points from this part of the
+/// translation's length on.
+constexpr double kRollingThetaSlack_rad = 1e-3;
+constexpr double kLeastOfTranslation = 1e-3;
 /// Longest distance from the image's corner, as the lens' equation counts, that single precision
 /// gives to 0.02 px.
 constexpr double kMostSinglePrecision_px = 10000.0;
@@ -55,64 +59,52 @@ void append(const Eigen::Vector3d& p_camera, const CameraModel& camera, const Tw
   points->theta.push_back(static_cast<float>(camera.theta(seen->p_camera)));
 }
 
-/// clampedRowTime() in single precision.
-class RollingRows {
- public:
-  explicit RollingRows(const CameraModel& camera)
-      : down_(camera.rowTimes().down),
-        at_zero_s_(static_cast<float>(camera.rowTimes().at_zero_s)),
-        per_px_s_(static_cast<float>(camera.rowTimes().per_px_s)),
-        side_(static_cast<float>(down_ ? camera.imageSize().height : camera.imageSize().width)) {}
-
-  void times(const PixelBlock& block, int count, float* times_s) const {
-    const float* pixel = down_ ? block.v : block.u;
-    for (int k = 0; k < count; ++k) {
-      const float row = std::max(-side_, std::min(pixel[k], 2.0f * side_));
-      times_s[k] = at_zero_s_ + per_px_s_ * row;
-    }
+Flow flowOf(const Twist& twist) {
+  Flow flow{};
+  for (int axis = 0; axis < 3; ++axis) {
+    flow.velocity[axis] = static_cast<float>(twist.velocity[axis]);
+    flow.turn[axis] = static_cast<float>(twist.turn[axis]);
   }
+  return flow;
+}
 
- private:
-  bool down_;
-  float at_zero_s_, per_px_s_, side_;
-};
-
-/// seenLater() in single precision: p + t (first p + ...) + t^2 (second p + ...).
-class Flow {
- public:
-  explicit Flow(const Twist& twist) {
-    for (int axis = 0; axis < 4; ++axis) {
-      const Eigen::Vector3d flow =
-          axis < 3 ? twist.turn.cross(Eigen::Vector3d::Unit(axis)) : twist.velocity;
-      const Eigen::Vector3d turned = 0.5 * twist.turn.cross(flow);
-      for (int row = 0; row < 3; ++row) {
-        first_[row][axis] = static_cast<float>(-flow[row]);
-        second_[row][axis] = static_cast<float>(turned[row]);
-      }
-    }
-  }
-
-  void apply(const float* times_s, int count, SelectedPoints* points) const {
-    for (int k = 0; k < count; ++k) {
-      const float t = times_s[k], x = points->x[k], y = points->y[k], z = points->z[k];
-      points->x[k] = x + t * (along(first_[0], x, y, z) + t * along(second_[0], x, y, z));
-      points->y[k] = y + t * (along(first_[1], x, y, z) + t * along(second_[1], x, y, z));
-      points->z[k] = z + t * (along(first_[2], x, y, z) + t * along(second_[2], x, y, z));
-    }
-  }
-
- private:
-  static float along(const float* row, float x, float y, float z) {
-    return (row[0] * x + row[1] * y) + (row[2] * z + row[3]);
-  }
-  float first_[3][4], second_[3][4];
-};
+/// seePoint() in single precision. `motion`: the camera's.
+RollingRows rollingRows(const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>& image_from_lidar,
+                        const Transform& T_camera_lidar, const CameraModel& camera,
+                        const std::array<double, 4>& k, const Twist& motion) {
+  Transform T_image_camera = Transform::Identity();
+  T_image_camera.linear() = camera.R_raw_camera();
+  T_image_camera.translation() = -(camera.R_raw_camera() * camera.opticalCentre());
+  const RowTimes& times = camera.rowTimes();
+  const double side = times.down ? camera.imageSize().height : camera.imageSize().width;
+  RollingRows rows{};
+  for (int i = 0; i < 12; ++i) rows.matrix[i] = static_cast<float>(image_from_lidar.data()[i]);
+  rows.k[0] = 1.0f;
+  for (std::size_t i = 0; i < 4; ++i) rows.k[i + 1] = static_cast<float>(k[i]);
+  rows.per_right = static_cast<float>(times.down ? 0.0 : camera.fx());
+  rows.per_down = static_cast<float>(times.down ? camera.fy() : camera.fx() * camera.skew());
+  rows.at_centre = static_cast<float>(times.down ? camera.cy() : camera.cx());
+  rows.begin = static_cast<float>(-side);
+  rows.end = static_cast<float>(2.0 * side);
+  rows.at_zero_s = static_cast<float>(times.at_zero_s);
+  rows.per_px_s = static_cast<float>(times.per_px_s);
+  rows.theta_sure = static_cast<float>(camera.maxThetaRad() - kRollingThetaSlack_rad);
+  rows.theta_never = static_cast<float>(camera.maxThetaRad() + kRollingThetaSlack_rad);
+  rows.least_squared_m2 = static_cast<float>(
+      std::max(kLeastSquaredDistance,
+               kLeastOfTranslation * kLeastOfTranslation * image_from_lidar.col(3).squaredNorm()));
+  rows.in_image = flowOf(twistOf(T_image_camera, motion));
+  rows.in_lidar = flowOf(twistOf(T_camera_lidar.inverse(Eigen::Isometry), motion));
+  return rows;
+}
 
 /// The equidistant model in single precision, from the transformed point on.
 class FastEquidistant {
  public:
+  /// `motion`: the camera's where its shutter rolls, else null.
   FastEquidistant(const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>& image_from_lidar,
-                  const CameraModel& camera, const std::array<double, 4>& k, const Bounds& bounds) {
+                  const Transform& T_camera_lidar, const CameraModel& camera,
+                  const std::array<double, 4>& k, const Twist* motion, const Bounds& bounds) {
     std::copy_n(image_from_lidar.data(), 12, lens_.matrix);
     lens_.focal_x = static_cast<float>(camera.fx());
     lens_.focal_y = static_cast<float>(camera.fy());
@@ -125,14 +117,20 @@ class FastEquidistant {
     lens_.u_begin = lens_.v_begin = static_cast<float>(bounds.begin);
     lens_.u_end = static_cast<float>(bounds.u_end);
     lens_.v_end = static_cast<float>(bounds.v_end);
+    if (motion != nullptr) {
+      rows_ = rollingRows(image_from_lidar, T_camera_lidar, camera, k, *motion);
+    }
   }
 
   void project(const SelectedPoints& selected, int count, std::uint32_t first,
                const Transform& T_camera_lidar, const CameraModel& camera, const Twist* motion,
                const Bounds& bounds, const Cloud& cloud, ProjectedPoints* points) {
-    const int kept = motion != nullptr
-                         ? rolled(selected, count, first, T_camera_lidar, camera, *motion, cloud)
-                         : projectionKernels().equidistant(lens_, selected, count, &block_);
+    const SelectedPoints* seen = &selected;
+    if (rows_) {
+      count = projectionKernels().roll(*rows_, selected, count, &moved_);
+      seen = &moved_;
+    }
+    const int kept = projectionKernels().equidistant(lens_, *seen, count, &block_);
     int begin = 0;
     for (int k = 0; k < block_.doubtful_count; ++k) {
       const int doubtful = static_cast<int>(block_.doubtful[k]);
@@ -155,54 +153,10 @@ class FastEquidistant {
     points->theta.insert(points->theta.end(), block_.theta + begin, block_.theta + end);
   }
 
-  /// The two rounds of seePoint() for a block, with the lidar's motion instead of the camera's.
-  /// What is doubtful in a round stays where it is, and so is doubtful in the last one.
-  int rolled(const SelectedPoints& selected, int count, std::uint32_t first,
-             const Transform& T_camera_lidar, const CameraModel& camera, const Twist& motion,
-             const Cloud& cloud) {
-    EquidistantLens anywhere = lens_;
-    anywhere.u_begin = anywhere.v_begin = -std::numeric_limits<float>::max();
-    anywhere.u_end = anywhere.v_end = std::numeric_limits<float>::max();
-    const RollingRows rows(camera);
-    const Flow flow(twistOf(T_camera_lidar.inverse(Eigen::Isometry), motion));
-    const auto move = [&](int kept) {
-      for (int k = 0; k < kept; ++k) {
-        const std::size_t i = first + moved_.place[k];
-        moved_.x[k] = cloud.x[i], moved_.y[k] = cloud.y[i], moved_.z[k] = cloud.z[i];
-      }
-      flow.apply(time_, kept, &moved_);
-    };
-
-    int kept = projectionKernels().equidistant(anywhere, selected, count, &block_);
-    rows.times(block_, kept, time_);
-    for (int k = 0; k < block_.doubtful_count; ++k) time_[block_.doubtful[k]] = 0.0f;
-    std::copy_n(block_.place, kept, moved_.place);
-    move(kept);
-
-    // The kernel's `place` is this round's order, so that the times of the first are found.
-    float earlier[kProjectionRoom];
-    std::uint32_t place[kProjectionRoom];
-    std::copy_n(time_, kept, earlier);
-    std::copy_n(moved_.place, kept, place);
-    for (int k = 0; k < kept; ++k) moved_.place[k] = static_cast<std::uint32_t>(k);
-    kept = projectionKernels().equidistant(anywhere, moved_, kept, &block_);
-    rows.times(block_, kept, time_);
-    for (int k = 0; k < block_.doubtful_count; ++k) {
-      time_[block_.doubtful[k]] = earlier[block_.place[block_.doubtful[k]]];
-    }
-    for (int k = 0; k < kept; ++k) {
-      const std::uint32_t before = block_.place[k];
-      time_[k] = secantTime(earlier[before], time_[k]);
-      moved_.place[k] = place[before];
-    }
-    move(kept);
-    return projectionKernels().equidistant(lens_, moved_, kept, &block_);
-  }
-
   EquidistantLens lens_;
-  PixelBlock block_;
+  std::optional<RollingRows> rows_;
   SelectedPoints moved_;
-  float time_[kProjectionRoom];  ///< s, of the rows of the points in moved_
+  PixelBlock block_;
 };
 
 bool singlePrecisionSuffices(const CameraModel& camera, const Bounds& bounds) {
@@ -215,13 +169,17 @@ bool singlePrecisionSuffices(const CameraModel& camera, const Bounds& bounds) {
 
 /// `motion`: also what comes into view while the rows are exposed; null = nothing does.
 SightCone sightCone(const Eigen::Matrix<double, 3, 4, Eigen::RowMajor>& image_from_lidar,
-                    double theta_rad, const CameraModel& camera, const Twist* motion) {
+                    double margin_px, const CameraModel& camera, const Twist* motion) {
+  double theta_rad = camera.maxThetaWithin(margin_px);
   double moved_m = 0.0;
   if (motion != nullptr) {
+    // A pixel that is kept has its row within the margin, so that its time is known to a quarter
+    // of the readout even where two rounds are far from the end.
     const RowTimes& rows = camera.rowTimes();
     const double side = rows.down ? camera.imageSize().height : camera.imageSize().width;
-    const double longest_s = std::max(std::abs(rows.at_zero_s - rows.per_px_s * side),
-                                      std::abs(rows.at_zero_s + 2.0 * rows.per_px_s * side));
+    const double beyond = std::min(side, margin_px + 0.25 * side);
+    const double longest_s = std::max(std::abs(rows.at_zero_s - rows.per_px_s * beyond),
+                                      std::abs(rows.at_zero_s + rows.per_px_s * (side + beyond)));
     theta_rad = std::min(kPi, theta_rad + longest_s * motion->turn.norm());
     moved_m = longest_s * motion->velocity.norm();
   }
@@ -241,12 +199,13 @@ ProjectedPoints projectCloud(const Cloud& cloud, const Transform& T_camera_lidar
   const Bounds bounds{-0.5 - margin_px, camera.imageSize().width - 0.5 + margin_px,
                       camera.imageSize().height - 0.5 + margin_px};
   const auto image_from_lidar = imageFromLidar(T_camera_lidar, camera);
-  const SightCone cone =
-      sightCone(image_from_lidar, camera.maxThetaWithin(margin_px), camera, motion);
+  const SightCone cone = sightCone(image_from_lidar, margin_px, camera, motion);
   const std::array<double, 4>* coefficients = camera.lens().kannalaBrandt();
   const bool fast = coefficients != nullptr && singlePrecisionSuffices(camera, bounds);
   std::optional<FastEquidistant> equidistant;
-  if (fast) equidistant.emplace(image_from_lidar, camera, *coefficients, bounds);
+  if (fast) {
+    equidistant.emplace(image_from_lidar, T_camera_lidar, camera, *coefficients, motion, bounds);
+  }
 
   ProjectedPoints points;
   const std::size_t expected = cloud.size() / 3;

@@ -50,6 +50,24 @@ struct PixelBlock {
   int doubtful_count;
 };
 
+/// A Twist in single precision.
+struct Flow {
+  float velocity[3];  ///< m/s
+  float turn[3];      ///< rad/s
+};
+
+/// Rows of a rolling shutter behind an equidistant lens. Single precision suffices for times.
+struct RollingRows {
+  float matrix[12];  ///< rows of the transform from the lidar to the image's axes
+  float k[5];        ///< 1, and the coefficients of the lens (eq. 9)
+  float per_right, per_down, at_centre;  ///< px: the row of a direction (a, b) on the image plane
+  float begin, end;                      ///< px; rows beyond count as these
+  float at_zero_s, per_px_s;             ///< when rows are exposed
+  float theta_sure, theta_never;         ///< rad, as in EquidistantLens, with slack for the matrix
+  float least_squared_m2;                ///< of points whose angle is right within that slack
+  Flow in_image, in_lidar;               ///< of what stands still, in both axes
+};
+
 struct ProjectionKernels {
   const char* name;
 
@@ -62,6 +80,12 @@ struct ProjectionKernels {
   /// are not doubtful, the angle is right to 5e-7 rad.
   int (*equidistant)(const EquidistantLens& lens, const SelectedPoints& points, int count,
                      PixelBlock* out);
+
+  /// Moves the first `count` points to where they are when their rows are exposed: two rounds, of
+  /// which the second follows the secant. Returns how many have a pixel in both; of a point that is
+  /// doubtful in either x is NaN, so that `equidistant` doubts it too.
+  int (*roll)(const RollingRows& rows, const SelectedPoints& points, int count,
+              SelectedPoints* out);
 };
 
 extern const ProjectionKernels kPlainProjectionKernels;
@@ -80,6 +104,8 @@ ProjectionKernelList usableProjectionKernels();
 constexpr float kAtan[9] = {1.000000000e+00f,  -3.333306611e-01f, 1.999248415e-01f,
                             -1.420257092e-01f, 1.063675433e-01f,  -7.495445758e-02f,
                             4.258760810e-02f,  -1.600502990e-02f, 2.834064187e-03f};
+/// The same to 1.2e-5 (Abramowitz and Stegun, 4.4.49): 0.02 px, which a row needs 0.3 us for.
+constexpr float kRoughAtan[5] = {0.9998660f, -0.3302995f, 0.1801410f, -0.0851330f, 0.0208351f};
 constexpr float kHalfTurn = 3.14159274f;
 constexpr float kQuarterTurn = 1.57079637f;
 /// Within these bounds single precision has the accuracy that is promised.
@@ -95,5 +121,7 @@ int selectFrom(const SightCone& cone, const float* x, const float* y, const floa
                int selected, SelectedPoints* out);
 int equidistantFrom(const EquidistantLens& lens, const SelectedPoints& points, int first, int count,
                     int kept, PixelBlock* out);
+int rollFrom(const RollingRows& rows, const SelectedPoints& points, int first, int count, int kept,
+             SelectedPoints* out);
 
 }  // namespace semantic_lidar_fusion

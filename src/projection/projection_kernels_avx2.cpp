@@ -35,13 +35,13 @@ inline void store(__m256i order, __m256i values, std::uint32_t* out) {
   _mm256_storeu_si256(reinterpret_cast<__m256i*>(out), _mm256_permutevar8x32_epi32(values, order));
 }
 
-inline __m256 rowTimes(const float* m, __m256 x, __m256 y, __m256 z) {
+inline __m256 along(const float* m, __m256 x, __m256 y, __m256 z) {
   return _mm256_add_ps(
       _mm256_add_ps(_mm256_mul_ps(_mm256_set1_ps(m[0]), x), _mm256_mul_ps(_mm256_set1_ps(m[1]), y)),
       _mm256_add_ps(_mm256_mul_ps(_mm256_set1_ps(m[2]), z), _mm256_set1_ps(m[3])));
 }
 
-inline __m256d rowTimes(const double* m, __m256d x, __m256d y, __m256d z) {
+inline __m256d along(const double* m, __m256d x, __m256d y, __m256d z) {
   return _mm256_add_pd(
       _mm256_add_pd(_mm256_mul_pd(_mm256_set1_pd(m[0]), x), _mm256_mul_pd(_mm256_set1_pd(m[1]), y)),
       _mm256_add_pd(_mm256_mul_pd(_mm256_set1_pd(m[2]), z), _mm256_set1_pd(m[3])));
@@ -68,8 +68,8 @@ int select(const SightCone& cone, const float* x, const float* y, const float* z
   for (; i + 8 <= count; i += 8) {
     const __m256 vx = _mm256_loadu_ps(x + i), vy = _mm256_loadu_ps(y + i);
     const __m256 vz = _mm256_loadu_ps(z + i);
-    const __m256 px = rowTimes(m, vx, vy, vz), py = rowTimes(m + 4, vx, vy, vz);
-    const __m256 pz = rowTimes(m + 8, vx, vy, vz);
+    const __m256 px = along(m, vx, vy, vz), py = along(m + 4, vx, vy, vz);
+    const __m256 pz = along(m + 8, vx, vy, vz);
     const __m256 distance =
         _mm256_sqrt_ps(_mm256_add_ps(sumOfSquares(px, py), _mm256_mul_ps(pz, pz)));
     const __m256 outside =
@@ -100,9 +100,9 @@ inline Four transformed(const double* m, const float* x, const float* y, const f
   const __m256d vx = _mm256_cvtps_pd(_mm_loadu_ps(x)), vy = _mm256_cvtps_pd(_mm_loadu_ps(y));
   const __m256d vz = _mm256_cvtps_pd(_mm_loadu_ps(z));
   Four p;
-  p.x = rowTimes(m, vx, vy, vz);
-  p.y = rowTimes(m + 4, vx, vy, vz);
-  p.z = rowTimes(m + 8, vx, vy, vz);
+  p.x = along(m, vx, vy, vz);
+  p.y = along(m + 4, vx, vy, vz);
+  p.z = along(m + 8, vx, vy, vz);
   p.squared = _mm256_add_pd(_mm256_add_pd(_mm256_mul_pd(p.x, p.x), _mm256_mul_pd(p.y, p.y)),
                             _mm256_mul_pd(p.z, p.z));
   return p;
@@ -115,6 +115,145 @@ inline unsigned measurable(__m256d squared) {
 }
 
 inline unsigned bits(__m256 mask) { return static_cast<unsigned>(_mm256_movemask_ps(mask)); }
+
+/// Eight points.
+struct Eight {
+  __m256 x, y, z;
+};
+
+/// As in the plain kernels.
+inline __m256 series(const float* c, __m256 s) {
+  const __m256 s2 = _mm256_mul_ps(s, s);
+  const __m256 low = _mm256_add_ps(_mm256_set1_ps(c[0]), _mm256_mul_ps(s, _mm256_set1_ps(c[1])));
+  const __m256 middle = _mm256_add_ps(_mm256_set1_ps(c[2]), _mm256_mul_ps(s, _mm256_set1_ps(c[3])));
+  const __m256 high = _mm256_add_ps(middle, _mm256_mul_ps(s2, _mm256_set1_ps(c[4])));
+  return _mm256_add_ps(low, _mm256_mul_ps(s2, high));
+}
+
+/// As in the plain kernels.
+struct RowSeen {
+  __m256 time_s, sure, never;
+};
+
+inline RowSeen rowSeen(const RollingRows& rows, const Eight& p) {
+  const __m256 right = p.x, down = p.y, forward = p.z;
+  const __m256 squared_from_axis = sumOfSquares(right, down);
+  const __m256 squared = _mm256_add_ps(squared_from_axis, _mm256_mul_ps(forward, forward));
+  const __m256 from_axis = _mm256_sqrt_ps(squared_from_axis);
+  const __m256 along_axis = _mm256_andnot_ps(_mm256_set1_ps(-0.0f), forward);
+  const __m256 near_axis = smaller(from_axis, along_axis);
+  const __m256 q = _mm256_div_ps(_mm256_blendv_ps(along_axis, from_axis, near_axis),
+                                 _mm256_blendv_ps(from_axis, along_axis, near_axis));
+  const __m256 atan = _mm256_mul_ps(q, series(kRoughAtan, _mm256_mul_ps(q, q)));
+  const __m256 acute =
+      _mm256_blendv_ps(_mm256_sub_ps(_mm256_set1_ps(kQuarterTurn), atan), atan, near_axis);
+  const __m256 theta = _mm256_blendv_ps(acute, _mm256_sub_ps(_mm256_set1_ps(kHalfTurn), acute),
+                                        smaller(forward, _mm256_setzero_ps()));
+  const __m256 distorted = _mm256_mul_ps(theta, series(rows.k, _mm256_mul_ps(theta, theta)));
+  const __m256 scale = _mm256_div_ps(distorted, from_axis);
+  const __m256 a = _mm256_mul_ps(right, scale), b = _mm256_mul_ps(down, scale);
+  const __m256 row = _mm256_add_ps(_mm256_add_ps(_mm256_mul_ps(_mm256_set1_ps(rows.per_right), a),
+                                                 _mm256_mul_ps(_mm256_set1_ps(rows.per_down), b)),
+                                   _mm256_set1_ps(rows.at_centre));
+  const __m256 clamped =
+      _mm256_max_ps(_mm256_min_ps(row, _mm256_set1_ps(rows.end)), _mm256_set1_ps(rows.begin));
+  const __m256 most = _mm256_set1_ps(static_cast<float>(kMostSquaredDistance));
+  const __m256 measurable = _mm256_and_ps(
+      _mm256_and_ps(_mm256_cmp_ps(squared, _mm256_set1_ps(rows.least_squared_m2), _CMP_GE_OQ),
+                    _mm256_cmp_ps(squared, most, _CMP_LE_OQ)),
+      _mm256_cmp_ps(from_axis, _mm256_set1_ps(kLeastFromAxis), _CMP_GE_OQ));
+  return {_mm256_add_ps(_mm256_set1_ps(rows.at_zero_s),
+                        _mm256_mul_ps(_mm256_set1_ps(rows.per_px_s), clamped)),
+          _mm256_and_ps(measurable, smaller(theta, _mm256_set1_ps(rows.theta_sure))),
+          _mm256_and_ps(measurable, smaller(_mm256_set1_ps(rows.theta_never), theta))};
+}
+
+inline __m256 difference(float a, __m256 p, float b, __m256 q) {
+  return _mm256_sub_ps(_mm256_mul_ps(_mm256_set1_ps(a), p), _mm256_mul_ps(_mm256_set1_ps(b), q));
+}
+
+inline Eight cross(const float* a, const Eight& b) {
+  return {difference(a[1], b.z, a[2], b.y), difference(a[2], b.x, a[0], b.z),
+          difference(a[0], b.y, a[1], b.x)};
+}
+
+inline __m256 later(__m256 p, __m256 t_s, __m256 half_s, __m256 first, __m256 second) {
+  return _mm256_sub_ps(p, _mm256_mul_ps(t_s, _mm256_sub_ps(first, _mm256_mul_ps(half_s, second))));
+}
+
+/// As in the plain kernels.
+inline Eight seenLater(const Flow& flow, const Eight& p, __m256 t_s) {
+  const __m256 half_s = _mm256_mul_ps(_mm256_set1_ps(0.5f), t_s);
+  Eight first = cross(flow.turn, p);
+  first.x = _mm256_add_ps(first.x, _mm256_set1_ps(flow.velocity[0]));
+  first.y = _mm256_add_ps(first.y, _mm256_set1_ps(flow.velocity[1]));
+  first.z = _mm256_add_ps(first.z, _mm256_set1_ps(flow.velocity[2]));
+  const Eight second = cross(flow.turn, first);
+  return {later(p.x, t_s, half_s, first.x, second.x), later(p.y, t_s, half_s, first.y, second.y),
+          later(p.z, t_s, half_s, first.z, second.z)};
+}
+
+/// secantTime() of rolling_shutter.h.
+inline __m256 secant(__m256 t1, __m256 f_t1) {
+  const __m256 sign = _mm256_set1_ps(-0.0f);
+  const __m256 rise = _mm256_sub_ps(f_t1, t1);
+  const __m256 steep = smaller(_mm256_mul_ps(_mm256_set1_ps(2.0f), _mm256_andnot_ps(sign, rise)),
+                               _mm256_andnot_ps(sign, t1));
+  return _mm256_blendv_ps(f_t1, _mm256_div_ps(_mm256_mul_ps(t1, t1), _mm256_sub_ps(t1, rise)),
+                          steep);
+}
+
+/// The first round of a block. Rounds have loops of their own: a round is a chain of operations
+/// that wait for each other, of which the processor overlaps those of several points.
+struct FirstRound {
+  float right[kProjectionRoom], down[kProjectionRoom], forward[kProjectionRoom];  ///< m
+  float time_s[kProjectionRoom], sure[kProjectionRoom], never[kProjectionRoom];   ///< lanes' masks
+};
+
+inline void firstRound(const RollingRows& rows, const SelectedPoints& points, int i,
+                       FirstRound* out) {
+  const float* m = rows.matrix;
+  const __m256 x = _mm256_loadu_ps(points.x + i), y = _mm256_loadu_ps(points.y + i);
+  const __m256 z = _mm256_loadu_ps(points.z + i);
+  const Eight p{along(m, x, y, z), along(m + 4, x, y, z), along(m + 8, x, y, z)};
+  const RowSeen seen = rowSeen(rows, p);
+  _mm256_storeu_ps(out->right + i, p.x);
+  _mm256_storeu_ps(out->down + i, p.y);
+  _mm256_storeu_ps(out->forward + i, p.z);
+  _mm256_storeu_ps(out->time_s + i, seen.time_s);
+  _mm256_storeu_ps(out->sure + i, seen.sure);
+  _mm256_storeu_ps(out->never + i, seen.never);
+}
+
+int roll(const RollingRows& rows, const SelectedPoints& points, int count, SelectedPoints* out) {
+  const __m256 nan = _mm256_castsi256_ps(_mm256_set1_epi32(0x7fc00000));
+  const int whole = count / 8 * 8;
+  FirstRound first;
+  for (int i = 0; i < whole; i += 8) firstRound(rows, points, i, &first);
+  int kept = 0;
+  for (int i = 0; i < whole; i += 8) {
+    const Eight p{_mm256_loadu_ps(first.right + i), _mm256_loadu_ps(first.down + i),
+                  _mm256_loadu_ps(first.forward + i)};
+    const __m256 t1 = _mm256_loadu_ps(first.time_s + i);
+    const RowSeen seen = rowSeen(rows, seenLater(rows.in_image, p, t1));
+    const __m256 first_sure = _mm256_loadu_ps(first.sure + i);
+    const __m256 sure = _mm256_and_ps(first_sure, seen.sure);
+    const __m256 never =
+        _mm256_or_ps(_mm256_loadu_ps(first.never + i), _mm256_and_ps(first_sure, seen.never));
+    const Eight from{_mm256_loadu_ps(points.x + i), _mm256_loadu_ps(points.y + i),
+                     _mm256_loadu_ps(points.z + i)};
+    const Eight to = seenLater(rows.in_lidar, from, secant(t1, seen.time_s));
+    const unsigned keep = ~bits(never) & 0xffU;
+    const __m256i order = lanesOf(keep);
+    store(order, _mm256_blendv_ps(nan, to.x, sure), out->x + kept);
+    store(order, to.y, out->y + kept);
+    store(order, to.z, out->z + kept);
+    store(order, _mm256_loadu_si256(reinterpret_cast<const __m256i*>(points.place + i)),
+          out->place + kept);
+    kept += __builtin_popcount(keep);
+  }
+  return rollFrom(rows, points, whole, count, kept, out);
+}
 
 int equidistant(const EquidistantLens& lens, const SelectedPoints& points, int count,
                 PixelBlock* out) {
@@ -193,6 +332,6 @@ int equidistant(const EquidistantLens& lens, const SelectedPoints& points, int c
 
 }  // namespace
 
-const ProjectionKernels kAvx2ProjectionKernels = {"avx2", select, equidistant};
+const ProjectionKernels kAvx2ProjectionKernels = {"avx2", select, equidistant, roll};
 
 }  // namespace semantic_lidar_fusion

@@ -46,6 +46,14 @@ double motionVariance(double time_s, double correlation_s) {
   return correlation_s * correlation_s * doubled;
 }
 
+bool statesErrors(const RigErrors& rig, const CameraErrors& camera) {
+  const MotionErrors& motion = rig.motion;
+  return rig.lidar_stamp_s > 0.0 || rig.camera_stamp_s > 0.0 || rig.lidar.range_m > 0.0 ||
+         !rig.lidar.beam_deg.isZero(0.0) || !motion.velocity_mps.isZero(0.0) ||
+         !motion.rate_deg_s.isZero(0.0) || motion.scale > 0.0 || !camera.extrinsics.isZero(0.0) ||
+         camera.intrinsics_px > 0.0;
+}
+
 ViewErrors viewErrors(const RigErrors& rig, const CameraErrors& camera,
                       const std::optional<ViewMotion>& motion, double image_after_reference_s) {
   ViewErrors errors;

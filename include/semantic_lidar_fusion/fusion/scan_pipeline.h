@@ -103,10 +103,6 @@ class ScanPipeline {
   RowBand lidarRows(std::size_t index, const SegmentedImage& image) const;
   /// Throws std::logic_error if the step is not built.
   void require(PipelineStep step) const;
-  /// What is known of the errors of a view.
-  ViewErrors errorsOf(std::size_t camera, const CameraPlace& place, StampNs image_ns,
-                      StampNs reference_ns, const PoseBuffer& odometry,
-                      const std::optional<Transform>& T_vehicle_lidar) const;
 
   Rig rig_;
   std::uint32_t steps_ = 0;                       ///< bits

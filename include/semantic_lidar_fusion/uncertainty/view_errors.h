@@ -39,6 +39,10 @@ struct ViewMotion {
   Twist vehicle;  ///< at the image's time
 };
 
+/// Whether the rig states any error of a camera's views. Those of stamps and odometry count only
+/// where motion is known.
+bool statesErrors(const RigErrors& rig, const CameraErrors& camera);
+
 /// Of a camera whose image is taken `image_after_reference_s` after t_ref.
 ViewErrors viewErrors(const RigErrors& rig, const CameraErrors& camera,
                       const std::optional<ViewMotion>& motion, double image_after_reference_s);

@@ -66,6 +66,24 @@ EquidistantLens lens(double shift_m, float theta_limit) {
           399.5f};
 }
 
+/// Of a shutter that rolls along u or v, at 15 m/s and a fast turn.
+RollingRows rolling(const EquidistantLens& lens, bool down) {
+  RollingRows rows{};
+  for (int i = 0; i < 12; ++i) rows.matrix[i] = static_cast<float>(lens.matrix[i]);
+  rows.k[0] = 1.0f;
+  for (int i = 0; i < 4; ++i) rows.k[i + 1] = lens.k[i];
+  rows.per_right = down ? 0.0f : lens.focal_x;
+  rows.per_down = down ? lens.focal_y : lens.focal_x * lens.skew;
+  rows.at_centre = down ? lens.centre_y : lens.centre_x;
+  rows.begin = -400.0f, rows.end = 800.0f;
+  rows.at_zero_s = -0.015f, rows.per_px_s = 0.03f / 400.0f;
+  rows.theta_sure = lens.theta_sure - 1e-3f, rows.theta_never = lens.theta_never + 1e-3f;
+  rows.least_squared_m2 = 1e-6f;
+  rows.in_image = {{15.0f, 0.3f, -0.2f}, {0.02f, 1.5f, -0.01f}};
+  rows.in_lidar = {{-0.2f, -15.0f, 0.3f}, {-0.01f, 0.02f, -1.5f}};
+  return rows;
+}
+
 template <typename T>
 void expectSameBytes(const T* a, const T* b, int count, const char* what) {
   EXPECT_EQ(std::memcmp(a, b, sizeof(T) * static_cast<std::size_t>(count)), 0) << what;
@@ -128,6 +146,41 @@ TEST_P(WideKernels, GiveTheBytesOfThePlainOnes) {
   EXPECT_GT(selected_in_all, 5000);
   EXPECT_GT(kept_in_all, 1000);
   EXPECT_GT(doubtful_in_all, 100);
+}
+
+TEST_P(WideKernels, RollAsThePlainOnes) {
+  int points_in_all = 0, rolled_in_all = 0, doubtful_in_all = 0;
+  for (const int count : {0, 1, 7, 8, 9, 100, 511, 512}) {
+    for (std::uint32_t seed = 0; seed < 20; ++seed) {
+      SCOPED_TRACE(std::to_string(count) + " points, seed " + std::to_string(seed));
+      const Points points = hardPoints(count, seed);
+      SelectedPoints all, expected, rolled;
+      for (int i = 0; i < count; ++i) {
+        all.x[i] = points.x[i], all.y[i] = points.y[i], all.z[i] = points.z[i];
+        all.place[i] = static_cast<std::uint32_t>(3 * i);
+      }
+      const RollingRows rows =
+          rolling(lens(0.3f, seed % 2 == 0 ? 3.14159265f : 1.3f), seed % 4 < 2);
+      const int kept = kPlainProjectionKernels.roll(rows, all, count, &expected);
+      ASSERT_EQ(GetParam()->roll(rows, all, count, &rolled), kept);
+      expectSameBytes(rolled.place, expected.place, kept, "place");
+      for (int k = 0; k < kept; ++k) {
+        ASSERT_EQ(std::isnan(rolled.x[k]), std::isnan(expected.x[k]));
+        if (std::isnan(expected.x[k])) {
+          ++doubtful_in_all;
+          continue;  // y and z mean nothing
+        }
+        EXPECT_EQ(rolled.x[k], expected.x[k]);
+        EXPECT_EQ(rolled.y[k], expected.y[k]);
+        EXPECT_EQ(rolled.z[k], expected.z[k]);
+      }
+      points_in_all += count;
+      rolled_in_all += kept;
+    }
+  }
+  EXPECT_GT(points_in_all - rolled_in_all, 1000);
+  EXPECT_GT(doubtful_in_all, 100);
+  EXPECT_GT(rolled_in_all - doubtful_in_all, 5000);
 }
 
 TEST_P(WideKernels, SelectNeverLosesAPointOfTheCone) {
