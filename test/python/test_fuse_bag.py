@@ -196,6 +196,18 @@ def test_wrong_transport_is_told(room, tmp_path):
     assert "transport: raw" in result.stderr
 
 
+def test_scans_without_a_point_are_the_reason(room, tmp_path):
+    def change(topic, message):
+        if topic == "/points":
+            message.data = b"\0" * len(message.data)
+
+    rewritten(room.bag, tmp_path / "in.bag", change)
+    result = run(tmp_path / "in.bag", tmp_path / "out.bag", "--rig", room.rig, "--quiet")
+    assert result.returncode == 1
+    error = result.stderr.splitlines()[-1]
+    assert "no point of its scans came out" in error and "points without a return" in error, error
+
+
 WITHOUT_TRANSFORM = [
     # What of /tf_static is missing, frames that messages give another name, and what is said.
     (("velodyne", "front", "left"), {}, "no transform has a frame 'velodyne', of base_link, odom;"),

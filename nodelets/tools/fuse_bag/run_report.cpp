@@ -40,6 +40,7 @@ void RunReport::countScan(const Cloud& semantic) {
 }
 
 std::string RunReport::commonestStatus() const {
+  if (points_ == 0) return "no point of its scans came out";
   const auto most = std::max_element(by_status_.begin(), by_status_.end());
   return percent(*most, points_) + " of " + count(points_, "point") + ": " +
          kPointStatusNames[static_cast<std::size_t>(most - by_status_.begin())];
