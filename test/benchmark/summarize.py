@@ -245,7 +245,7 @@ def offline_rows(folder):
                 "fuse_bag, five JPEG cameras, " + size,
                 "%.2f" % figures["one thread"]["speed"],
                 "%.2f" % two,
-                goal(*OFFLINE_GOALS[size]),
+                *goal(*OFFLINE_GOALS[size]),
                 verdict(two, *OFFLINE_GOALS[size]),
                 "%.0f core-ms" % figures["two threads"]["cpu_ms_per_scan"],
                 "%.1fx" % (two / plain),
@@ -276,7 +276,8 @@ def machine(load_before):
 
 
 def goal(must, aim, unit=""):
-    return "" if must is None else "%g%s (%g%s)" % (must, unit, aim, unit)
+    """The two cells of a row's goals."""
+    return ["", ""] if must is None else ["%g%s" % (value, unit) for value in (must, aim)]
 
 
 def table(head, rows, style):
@@ -305,7 +306,7 @@ def print_tables(summary, style):
             milliseconds(row["ours_ms"]),
             "%s: %s" % (row["peer"], milliseconds(row["peer_ms"])),
             "%.1fx" % row["ratio"],
-            goal(row["must"], row["aim"], "x"),
+            *goal(row["must"], row["aim"], "x"),
             row["met"],
         ]
         for row in summary["ratios"]
@@ -317,11 +318,11 @@ def print_tables(summary, style):
                 "%.1f core-ms a scan" % row["cpu_ms_per_scan"],
                 "",
                 "",
-                goal(*row["goal"], " core-ms") if row["goal"] else "",
+                *goal(*(row["goal"] or (None, None)), " core-ms"),
                 row["met"],
             ]
         )
-    print(table(["stage", "ours", "peer", "ratio", "must (aim)", "met"], rows, style))
+    print(table(["stage", "ours", "peer", "ratio", "must", "aim", "met"], rows, style))
     if summary["rig"]:
         print()
         head = ["", "latency median", "99 %", "memory", "scans lost", "player", "goals"]
@@ -344,7 +345,8 @@ def print_tables(summary, style):
             "s of bag per s (rosbag play: 1)",
             "one thread",
             "two threads",
-            "must (aim)",
+            "must",
+            "aim",
             "met",
             "a scan",
             "plain numpy and OpenCV chain",

@@ -20,8 +20,9 @@ DOCUMENTS = sorted(
     + glob.glob(os.path.join(SOURCE_DIR, "docs", "*.md"))
     + [os.path.join(SOURCE_DIR, "test", "README.md")]
 )
-# Files whose tables are figures, and not lists of keys or of tests.
-WITH_FIGURES = ("accuracy", "labels", "maps", "performance", "results", "simulator", "uncertainty")
+# Tables of keys and settings, whose numbers nobody measures.
+NOT_MEASURED = ("## Errors on request",)
+NUMBER = r"[-+]?\d+(?: \d{3})*(?:\.\d+)?"
 
 
 def text_of(path):
@@ -64,6 +65,18 @@ def commands(text):
     return lines
 
 
+def inline_commands(text):
+    """Commands of the package that stand in a sentence: `evaluate.py a.bag --rig FILE`. What is left out
+    there (...), and lists of options that are no shell words, end a command."""
+    prose = re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines = []
+    for span in re.findall(r"(?<!`)`([^`]+)`(?!`)", prose):
+        words = span.split("...")[0].split()
+        if words and own_command(words):
+            lines.append(words)
+    return lines
+
+
 def own_command(words):
     """(command of the package, its arguments); None for other programs."""
     words = list(words)
@@ -74,7 +87,7 @@ def own_command(words):
     if not words:
         return None
     name = os.path.basename(words[0])
-    is_own = name in TOOLS or os.path.exists(os.path.join(SOURCE_DIR, "scripts", name))
+    is_own = name in TOOLS or os.path.isfile(os.path.join(SOURCE_DIR, "scripts", name))
     return (
         (name, words[1:]) if is_own and (words[0] != name or "." in name or name in TOOLS) else None
     )
@@ -182,6 +195,19 @@ def unexplained_figures(text):
     return problems
 
 
+def crowded_cells(text):
+    """Cells that hold nothing but several numbers: each number wants a cell of its own."""
+    unit = r" ?(?:%|[a-z-]{1,9})?"
+    several = re.compile(r"[*~]*{0}{1}[*]*(?: ?[,;/(]+ ?{0}{1}\)?)+".format(NUMBER, unit))
+    cells = []
+    for heading, body in sections(text):
+        if heading in NOT_MEASURED:
+            continue
+        for line in re.findall(r"^\|(.*)\| *$", body, re.MULTILINE):
+            cells += [cell.strip() for cell in line.split("|") if several.fullmatch(cell.strip())]
+    return cells
+
+
 @pytest.mark.parametrize("path", DOCUMENTS, ids=os.path.basename)
 def test_links(path):
     assert broken_links(path, text_of(path)) == []
@@ -190,7 +216,8 @@ def test_links(path):
 def test_commands():
     problems = []
     for path in DOCUMENTS:
-        for words in commands(text_of(path)):
+        text = text_of(path)
+        for words in commands(text) + inline_commands(text):
             problems += ["%s: %s" % (os.path.basename(path), wrong) for wrong in wrong_in(words)]
     assert problems == []
 
@@ -205,12 +232,14 @@ def test_the_readme_is_short():
     assert len(text_of(os.path.join(SOURCE_DIR, "README.md")).splitlines()) <= 200
 
 
-@pytest.mark.parametrize("name", WITH_FIGURES)
-def test_figures_name_their_command(name):
-    path = os.path.join(SOURCE_DIR, "docs", name + ".md")
-    if not os.path.exists(path):
-        pytest.skip("no docs/%s.md" % name)
+@pytest.mark.parametrize("path", DOCUMENTS, ids=os.path.basename)
+def test_figures_name_their_command(path):
     assert unexplained_figures(text_of(path)) == []
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=os.path.basename)
+def test_a_cell_holds_one_number(path):
+    assert crowded_cells(text_of(path)) == []
 
 
 def test_faults_are_seen(tmp_path):
@@ -227,6 +256,12 @@ def test_faults_are_seen(tmp_path):
     if rig_keys() is not None:
         words = ["fuse_bag", "a.bag", "b.bag", "--set", "occlusion.mood=paper", "--fast"]
         assert len(wrong_in(words)) == 2
+    inline = "Try `evaluate.py a.bag --hurry` and `fuse_bag ... --fast`, not `make it --fast`.\n"
+    assert [wrong for words in inline_commands(inline) for wrong in wrong_in(words)] == [
+        "evaluate.py has no option --hurry"
+    ]
+    crowd = "| 0.63 (1.74, 0) | 1.0 / 2.0 % | 3x (5x) | 1 ms, 2 ms | 0.5 | 12 344 | 1 scan | of 3, 4 |\n"
+    assert len(crowded_cells(crowd)) == 4
     bare = "# Speed\n| a | b |\n|---|---|\n| x | 1.5 |\n"
     assert unexplained_figures(bare) == ["# Speed"]
     assert unexplained_figures(bare.replace("# Speed", "# Speed\n`evaluate.py a.bag`")) == []
