@@ -16,9 +16,10 @@ EPILOG = """\
 INPUT is a bag with points_semantic (and class_info), as fuse_bag writes it, a map.submaps, which has
 all that its bags had and takes other --poses, or a map.voxels of an earlier run with the same options,
 which is added. Poses come from tf at each cloud's stamp,
-interpolated; fused bags hold no tf, so name the bags that do; or from files of corrected poses:
+interpolated: fuse_bag copies tf into its bags, and --tf names other bags that hold it. Or they come
+from files of corrected poses:
 
-  build_semantic_map.py fused.bag --tf drive.bag --out map
+  build_semantic_map.py fused.bag --out map
   build_semantic_map.py monday.bag tuesday.bag --tf monday_raw.bag tuesday_raw.bag --out map --workers 4
   build_semantic_map.py fused.bag --poses slam.tum --poses-frame base_link --tf drive.bag --out map
   build_semantic_map.py fused.bag --tf drive.bag --out map --scheduler tcp://10.0.0.5:8786
@@ -42,7 +43,9 @@ def make_parser():
     parser.add_argument(
         "--out", metavar="DIR", required=True, help="folder of the map; must be new"
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier map in --out")
+    parser.add_argument(
+        "--overwrite", "--force", action="store_true", help="replace an earlier map in --out"
+    )
     parser.add_argument(
         "--tf", metavar="BAG", nargs="+", default=[], help="bags with the tf of the inputs: one for "
         "each, in their order, or all for one input (default: the inputs themselves)",

@@ -406,7 +406,7 @@ def test_an_existing_folder_is_not_touched(room, built, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(built, str(copy))
     done = run(
-        room[0], "--tf", room[1], "--out", copy, "--overwrite", "--formats", "npz", "--voxel", 0.4
+        room[0], "--tf", room[1], "--out", copy, "--force", "--formats", "npz", "--voxel", 0.4
     )
     assert done.returncode == 0, done.stderr
     assert sorted(os.listdir(str(copy))) == ["map.json", "map.npz", "map.voxels"]

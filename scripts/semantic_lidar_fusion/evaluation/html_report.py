@@ -497,7 +497,8 @@ body{max-width:1100px;margin:0 auto;padding:1rem}
 h1{font-size:1.5rem}h2{font-size:1.2rem;margin-top:2rem;border-bottom:1px solid #d5dbe1}
 .wide{overflow-x:auto}table{border-collapse:collapse;font-size:.85rem;margin:.6rem 0}
 th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #e3e8ec;white-space:nowrap}
-th:first-child,td:first-child{text-align:left}thead th{border-bottom:2px solid #8a96a3}
+th:first-child,td:first-child{text-align:left}
+thead th{border-bottom:2px solid #8a96a3;white-space:normal;vertical-align:bottom}
 figure{margin:1rem 0}img{max-width:100%;height:auto}figcaption,.note,.axis{font-size:.8rem;color:#4c5864}
 svg{width:100%;height:90px;display:block;background:#f3f5f7}
 .axis{display:flex;justify-content:space-between;margin:.1rem 0 .8rem}.note{margin:.2rem 0}
