@@ -64,7 +64,7 @@ class Camera:
         pixel = np.asarray(self._model.project(points))
         with np.errstate(invalid="ignore"):
             inside = (pixel >= -0.5) & (pixel < np.array(self.size) - 0.5)
-        return pixel, inside.all(axis=1)
+        return pixel, np.asarray(inside.all(axis=1))
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Unit rays (N, 3) in the camera's frame of pixels (N, 2); NaN where no ray maps to one."""

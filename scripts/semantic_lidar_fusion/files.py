@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Files of users to read, and files to write whole or not at all."""
 
+import atexit
 import contextlib
 import fcntl
 import os
@@ -46,6 +47,9 @@ class AtomicFile:
         self.path = path
         _remove_leftovers(folder, name)
         self.temporary = os.path.join(folder, _prefix(name) + secrets.token_hex(8) + _ENDING)
+        self._lock = -1
+        # A signal may come where no context has been entered yet that would clean up.
+        atexit.register(self.discard)
         try:
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
             self._lock = os.open(self.temporary, flags, 0o666)
@@ -56,8 +60,8 @@ class AtomicFile:
 
     @contextlib.contextmanager
     def opening(self) -> Iterator[None]:
-        """For a writer's constructor: if the block fails or is interrupted, no context has been
-        entered yet that would clean up. DataError if the file cannot be written."""
+        """For a writer's constructor: the file vanishes if the block fails or is interrupted.
+        DataError if it cannot be written."""
         try:
             yield
         except BaseException as error:
@@ -72,14 +76,15 @@ class AtomicFile:
 
     def discard(self) -> None:
         """Removes the file unless it is committed."""
-        if self._lock >= 0:
-            with contextlib.suppress(FileNotFoundError):
-                os.remove(self.temporary)
-            self._unlock()
+        with contextlib.suppress(FileNotFoundError):
+            os.remove(self.temporary)
+        self._unlock()
 
     def _unlock(self) -> None:
-        os.close(self._lock)
+        if self._lock >= 0:
+            os.close(self._lock)
         self._lock = -1
+        atexit.unregister(self.discard)
 
 
 def _prefix(name: str) -> str:

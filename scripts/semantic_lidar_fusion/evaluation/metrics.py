@@ -35,7 +35,7 @@ class Confusion:
     """
 
     def __init__(self, rows: int):
-        self.matrix = np.zeros((rows, rows + 1), dtype=np.int64)
+        self.matrix: np.ndarray = np.zeros((rows, rows + 1), dtype=np.int64)
 
     def add(self, truth: np.ndarray, predicted: np.ndarray) -> None:
         """truth, predicted: (N,) rows. Points without a true row are left out."""
@@ -95,7 +95,7 @@ class VisibleConfusion:
 
     def __init__(self, rows: int):
         self.confusion = Confusion(rows)
-        self.intruders = np.zeros(rows, dtype=np.int64)
+        self.intruders: np.ndarray = np.zeros(rows, dtype=np.int64)
 
     def add(self, truth: np.ndarray, predicted: np.ndarray, seen: np.ndarray) -> None:
         """truth, predicted: (N,) rows, NO_LABEL without one; seen: (N,) bool. Points without a true

@@ -406,7 +406,7 @@ class Score:
         flags = scan.flags("visible")
         if flags is None:
             return None
-        chosen = np.ones(len(cloud), dtype=bool)
+        chosen: np.ndarray = np.ones(len(cloud), dtype=bool)
         if self._min_edge_px > 0:
             chosen = scan.points["edge_px"] > self._min_edge_px
         label = np.where(cloud.fused, cloud.label, NO_LABEL)[chosen]

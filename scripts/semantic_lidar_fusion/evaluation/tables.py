@@ -184,7 +184,7 @@ def table_one_csv(scores: Sequence[Score]) -> str:
 
 def confusion_csv(score: Score) -> str:
     """Counts; rows are the truth, columns the prediction."""
-    rows = [[name] + counts.tolist() for name, counts in zip(score.rows, score.confusion.matrix)]
+    rows = [[name, *counts] for name, counts in zip(score.rows, score.confusion.matrix.tolist())]
     return csv_text(["truth"] + score.rows + ["(discarded)"], rows)
 
 

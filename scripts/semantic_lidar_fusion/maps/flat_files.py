@@ -5,7 +5,7 @@ What is too large for one file comes in blocks, in the folder TILES_FOLDER, with
 each name."""
 
 import os
-from typing import Any, Dict, Iterator, Tuple
+from typing import Any, Dict, Iterator, Sequence, Tuple
 
 import numpy as np
 
@@ -135,6 +135,11 @@ _EMPTY_RGB = (214, 222, 232)
 _UNNAMED_RGB = (165, 172, 180)
 
 
+def _matplotlib_color(rgb: Sequence[int]) -> Tuple[float, float, float]:
+    red, green, blue = (float(value) / 255.0 for value in rgb)
+    return red, green, blue
+
+
 def _core(known: np.ndarray) -> Tuple[slice, slice]:
     """Rows and columns of a grid that hold nearly all of its known cells: single far points would
     make the picture small."""
@@ -177,11 +182,14 @@ def draw_picture(path: str, rasters: Rasters, labels: LabelSet, title: str) -> N
     axes.ticklabel_format(useOffset=False, style="plain")
     shown = [i for i in range(len(labels)) if (label == i).any()]
     handles = [
-        Patch(facecolor=labels.colors_rgb[i] / 255.0, edgecolor="0.5", label=labels[i].name)
+        Patch(
+            facecolor=_matplotlib_color(labels.colors_rgb[i]), edgecolor="0.5", label=labels[i].name
+        )
         for i in shown
     ]
-    unnamed = np.array(_UNNAMED_RGB) / 255.0
-    handles.append(Patch(facecolor=unnamed, edgecolor="0.5", label="no class"))
+    handles.append(
+        Patch(facecolor=_matplotlib_color(_UNNAMED_RGB), edgecolor="0.5", label="no class")
+    )
     axes.legend(
         handles=handles,
         loc="upper center",

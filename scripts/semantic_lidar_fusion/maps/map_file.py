@@ -78,9 +78,8 @@ def tiles_of(entries: np.ndarray, bits: int = 0) -> List[Tuple[Tile, int, int]]:
         return []
     x, y = entries["x"] >> (TILE_BITS - bits), entries["y"] >> (TILE_BITS - bits)
     change = np.flatnonzero((x[1:] != x[:-1]) | (y[1:] != y[:-1])) + 1
-    starts = [0] + change.tolist()
-    ends = change.tolist() + [len(entries)]
-    return [((int(x[a]), int(y[a])), a, b) for a, b in zip(starts, ends)]
+    bounds = [0, *(int(at) for at in change), len(entries)]
+    return [((int(x[a]), int(y[a])), a, b) for a, b in zip(bounds[:-1], bounds[1:])]
 
 
 def joined_path(parts: Sequence[np.ndarray]) -> np.ndarray:

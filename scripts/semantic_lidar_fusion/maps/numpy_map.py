@@ -229,7 +229,7 @@ class NumpyVoxelMap:
 
     def keep_inside(self, low: Sequence[int], high: Sequence[int]) -> None:
         def inside(indices: np.ndarray) -> np.ndarray:
-            return ((indices >= low) & (indices <= high)).all(axis=1)
+            return np.asarray(((indices >= low) & (indices <= high)).all(axis=1))
 
         state = self._state
         kept = inside(state.free)
@@ -336,7 +336,7 @@ class NumpyVoxelMap:
         own, theirs = voxel_indices(mine), voxel_indices(looks)
         keys = _Keys(own, theirs)
         k_own, k_looks, k_points = keys.of(own), keys.of(theirs), keys.of(indices)
-        least = np.full(len(looks), MAX_PASSES, dtype=np.int64)
+        least: np.ndarray = np.full(len(looks), MAX_PASSES, dtype=np.int64)
         order = np.argsort(k_looks)
         np.minimum.at(least, order[_find(k_looks[order], k_points)], passes)
         known = np.isin(k_looks, k_own)

@@ -3,7 +3,7 @@
 
 import os
 import tempfile
-from typing import Any, Dict
+from typing import Any, Dict, List
 
 import numpy as np
 
@@ -40,7 +40,8 @@ def write_octomap(source: MapSource, folder: str) -> Dict[str, Any]:
         )
     size = source.config.voxel_size_m
     offset = np.floor(np.array(source.extent.offset_m) / size).astype(np.int64)
-    occupied, colors, free = [], [], [np.zeros((0, 3), dtype=np.int64)]
+    occupied, colors = [], []
+    free: List[np.ndarray] = [np.zeros((0, 3), dtype=np.int64)]
     for tile, records, bricks in source.reader.read_tiles():
         layer = source.layers(tile, records)
         if remaining >= 0:

@@ -90,7 +90,7 @@ def _stream(topic: Topic, sensor: str) -> List[Finding]:
         return [Finding(sensor, "topic", Verdict.OK, figure)]
     result = []
     gaps = np.diff(times) / 1e9
-    if len(gaps) > 10 and gaps.max() > max(0.5, 5 * np.median(gaps)):
+    if len(gaps) > 10 and gaps.max() > max(0.5, 5 * float(np.median(gaps))):
         text = figure + ", longest gap %.2f s" % gaps.max()
         cause = "messages are missing"
         result.append(
