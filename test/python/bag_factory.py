@@ -120,6 +120,9 @@ class Drive:
     yaw_rate: float = 0.5
     origin: Tuple[float, float] = (0.0, 0.0)  # of the room in the fixed frame
     points_per_scan: int = 4000
+    rings: int = 16
+    scan_ns: int = 100_000_000
+    elevations_deg: Tuple[float, float] = (-15.0, 15.0)  # of the first and the last ring; points
     image_transport: str = "raw"  # or "compressed" (PNG), "jpeg"
     semantics: str = "scores"  # or "labels", "probabilities", "none"
     odometry: str = "tf"  # or "topic", "none"
@@ -153,11 +156,11 @@ class Drive:
 
     def scan_start_ns(self, index: int) -> int:
         """Time of the first point of a scan."""
-        return START_NS + 100_000_000 + index * 100_000_000
+        return START_NS + 100_000_000 + index * self.scan_ns
 
     @property
     def end_s(self) -> float:
-        return 0.3 + 0.1 * self.scans
+        return 0.3 + 1e-9 * self.scan_ns * self.scans
 
     # -- the room
 
@@ -222,12 +225,12 @@ class Drive:
 
     def scan_points(self, index: int) -> Tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points (n, 3) as measured, ring (n,) and time after the first point in ns (n,)."""
-        columns = self.points_per_scan // 16
-        column = np.repeat(np.arange(columns), 16)
-        ring = np.tile(np.arange(16), columns)
-        time_ns = column * (100_000_000 // columns)
+        columns = self.points_per_scan // self.rings
+        column = np.repeat(np.arange(columns), self.rings)
+        ring = np.tile(np.arange(self.rings), columns)
+        time_ns = column * (self.scan_ns // columns)
         azimuth = -2 * np.pi * column / columns
-        elevation = np.deg2rad(-15.0 + 2.0 * ring)
+        elevation = np.deg2rad(np.linspace(*self.elevations_deg, self.rings))[ring]
         directions = np.stack(
             [
                 np.cos(elevation) * np.cos(azimuth),
@@ -451,13 +454,13 @@ def write_bag(path: str, drive: Drive) -> None:
                 scan.packets.append(packet)
             # As the driver does: the header tells the last packet.
             scan.header.stamp = stamp(packets[-1][0] if packets else at_ns)
-            messages.append((at_ns + 100_000_000, "/velodyne_packets", scan))
+            messages.append((at_ns + drive.scan_ns, "/velodyne_packets", scan))
         else:
             points, ring, time_ns = drive.scan_points(index)
             if index in drive.empty_scans:
                 points, ring, time_ns = points[:0], ring[:0], time_ns[:0]
             cloud = cloud_message(points, ring, time_ns, at_ns)
-            messages.append((at_ns + 100_000_000, "/points", cloud))
+            messages.append((at_ns + drive.scan_ns, "/points", cloud))
 
     messages.sort(key=lambda m: m[0])
     with rosbag.Bag(path, "w", compression=drive.compression) as bag:

@@ -12,7 +12,7 @@ import rosbag  # noqa: E402
 from sensor_msgs.msg import PointField  # noqa: E402
 
 from bag_factory import START_NS, Drive, read_cloud, stamp  # noqa: E402
-from test_fuse_bag import Made, run  # noqa: E402
+from test_fuse_bag import Made, run, world_points  # noqa: E402
 
 SURFACE_M = 0.01  # right points lie on a surface; floats and odometry's interpolation cost less
 ABSOLUTE = np.dtype(
@@ -203,3 +203,27 @@ def test_a_transform_that_is_not_quite_normalised_is_taken(tmp_path):
     assert result.returncode == 0, result.stderr
     lines = [line for line in result.stderr.splitlines() if "norm 1.02" in line]
     assert len(lines) == 1 and "warning" in lines[0] and "1 is wanted" in lines[0]
+
+
+def test_a_lidar_of_128_rings_at_20_hz(tmp_path):
+    """262 144 points a scan, 20 scans a second: each point comes out, where it is, with its class."""
+    drive = Drive(
+        scans=2,
+        rings=128,
+        points_per_scan=128 * 2048,
+        scan_ns=50_000_000,
+        elevations_deg=(-25.0, 15.0),
+    )
+    made = Made(tmp_path, drive)
+    fused = made.fuse()
+    clouds = fused.clouds()
+    assert len(clouds) == drive.scans
+    for message, cloud, gap in zip(fused.of("/points_semantic"), clouds, gaps(made, fused)):
+        assert len(cloud) == drive.points_per_scan
+        assert gap.max() < SURFACE_M
+        world = world_points(drive, cloud, message.header.stamp.to_nsec())
+        labelled = cloud["status"] == 0
+        assert labelled.sum() > 0.3 * len(cloud)
+        right = drive.class_of(world[labelled]) == cloud["label"][labelled]
+        assert right.mean() > 0.98
+    assert "nothing was dropped" in fused.result.stdout
