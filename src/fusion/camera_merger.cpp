@@ -78,8 +78,34 @@ void mean(const PointVotes& point, int class_count, double* out) {
   }
 }
 
-/// The product of the distributions, each to the power `exponent`, normalised.
-void product(const PointVotes& point, int class_count, double exponent, double* out) {
+/// Products of two probabilities above this are exact to far more than single precision, and what
+/// underflows beside them is 0 there.
+constexpr double kSafeProduct = 1e-200;
+
+/// The normalised product of two distributions, or its square root; false, with `out` undefined, if
+/// it is too small everywhere to be formed without logarithms.
+bool productOfTwo(const PointVotes& point, int class_count, bool root, double* out) {
+  const double* a = point.votes[0].probabilities;
+  const double* b = point.votes[1].probabilities;
+  double largest = 0;
+  for (int c = 0; c < class_count; ++c) {
+    out[c] = a[c] * b[c];
+    largest = std::max(largest, out[c]);
+  }
+  if (!(largest >= kSafeProduct)) return false;
+  double sum = 0;
+  for (int c = 0; c < class_count; ++c) {
+    if (root) out[c] = std::sqrt(out[c]);
+    sum += out[c];
+  }
+  for (int c = 0; c < class_count; ++c) out[c] /= sum;
+  return true;
+}
+
+/// The product of the distributions, or its root of their number, normalised.
+void product(const PointVotes& point, int class_count, bool root, double* out) {
+  if (point.count == 2 && productOfTwo(point, class_count, root, out)) return;
+  const double exponent = root ? 1.0 / point.count : 1.0;
   double largest = -std::numeric_limits<double>::infinity();
   for (int c = 0; c < class_count; ++c) {
     out[c] = 0;
@@ -99,17 +125,19 @@ void product(const PointVotes& point, int class_count, double exponent, double* 
   for (int c = 0; c < class_count; ++c) out[c] /= sum;
 }
 
+/// `per_log_class_count`: null = without the entropy.
 void write(const double* distribution, const PointVotes& point, std::size_t i,
-           double per_log_class_count, const SoftmaxKernels& kernels, SemanticCloud* cloud) {
+           const double* per_log_class_count, const SoftmaxKernels& kernels, SemanticCloud* cloud) {
   const int class_count = cloud->class_count;
   float* out = &cloud->probabilities[i * static_cast<std::size_t>(class_count)];
   const int label = kernels.narrow(distribution, class_count, out);
-  const double entropy = kernels.entropy(distribution, class_count);
   cloud->points.status[i] = static_cast<std::uint8_t>(PointStatus::kFused);
   cloud->label[i] = static_cast<std::uint8_t>(label);
   cloud->confidence[i] = out[label];
-  cloud->entropy[i] =
-      static_cast<float>(std::min(1.0, std::max(0.0, entropy * per_log_class_count)));
+  if (per_log_class_count) {
+    const double entropy = kernels.entropy(distribution, class_count) * *per_log_class_count;
+    cloud->entropy[i] = static_cast<float>(std::min(1.0, std::max(0.0, entropy)));
+  }
   std::uint16_t cameras = 0;
   for (int k = 0; k < point.count; ++k) {
     cameras = static_cast<std::uint16_t>(cameras | (1u << point.votes[k].rig_index));
@@ -119,7 +147,7 @@ void write(const double* distribution, const PointVotes& point, std::size_t i,
 
 /// Merges points [begin, end).
 void mergeRange(const std::vector<CameraVotes>& votes, OverlapRule rule, std::size_t begin,
-                std::size_t end, SemanticCloud* cloud) {
+                std::size_t end, bool with_entropy, SemanticCloud* cloud) {
   const int class_count = cloud->class_count;
   const double per_log_class_count = class_count > 1 ? 1.0 / std::log(class_count) : 0.0;
   const SoftmaxKernels& kernels = softmaxKernels();
@@ -152,22 +180,22 @@ void mergeRange(const std::vector<CameraVotes>& votes, OverlapRule rule, std::si
     const double* distribution = point.votes[0].probabilities;
     if (point.count > 1) {
       if (rule == OverlapRule::kProduct) {
-        product(point, class_count, 1.0, merged.data());
+        product(point, class_count, false, merged.data());
       } else if (rule == OverlapRule::kGeometricMean) {
-        product(point, class_count, 1.0 / point.count, merged.data());
+        product(point, class_count, true, merged.data());
       } else {
         mean(point, class_count, merged.data());
       }
       distribution = merged.data();
     }
-    write(distribution, point, i, per_log_class_count, kernels, cloud);
+    write(distribution, point, i, with_entropy ? &per_log_class_count : nullptr, kernels, cloud);
   }
 }
 
 }  // namespace
 
 void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, SemanticCloud* cloud,
-                ThreadPool* pool) {
+                ThreadPool* pool, bool with_entropy) {
   const std::size_t points = cloud->points.size();
   checkVotes(votes, rule, points, cloud->class_count);
   cloud->label.assign(points, kNoLabel);
@@ -179,7 +207,7 @@ void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, Semanti
   constexpr std::size_t kShare = 4096;
   forEach(pool, static_cast<int>((points + kShare - 1) / kShare), [&](int share) {
     const std::size_t begin = kShare * static_cast<std::size_t>(share);
-    mergeRange(votes, rule, begin, std::min(points, begin + kShare), cloud);
+    mergeRange(votes, rule, begin, std::min(points, begin + kShare), with_entropy, cloud);
   });
 }
 

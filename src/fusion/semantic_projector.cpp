@@ -399,8 +399,9 @@ FusionResult SemanticProjector::fuse(const Cloud& cloud, std::vector<CameraView>
     for (const std::uint32_t i : outcome.would_see) improve(PointStatus::kNoImage, &status[i]);
     votes.push_back(std::move(outcome.votes));
   }
-  mergeVotes(votes, config_.overlap, &result.cloud, pool_.get());
-  if (any_image) smoothAlongSurfaces(grid, config_.smoothing, &result.cloud, pool_.get());
+  const bool smoothed = any_image && config_.smoothing.iterations > 0;
+  mergeVotes(votes, config_.overlap, &result.cloud, pool_.get(), !smoothed);
+  if (smoothed) smoothAlongSurfaces(grid, config_.smoothing, &result.cloud, pool_.get());
 
   for (std::size_t k = 0; k < views.size(); ++k) {
     CameraFusionReport& report = outcomes[k].report;

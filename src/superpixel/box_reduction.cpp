@@ -8,7 +8,6 @@
 namespace semantic_lidar_fusion {
 namespace {
 
-constexpr std::int64_t kSmallArea = 1 << 16;
 constexpr int kMaxRowsAhead = 4;  ///< as many rows of a camera's image as a first-level cache holds
 
 }  // namespace
@@ -107,7 +106,7 @@ const std::uint8_t* BoxReduction::row(const cv::Mat& image, int y, const SlicKer
   }
   kernels.sumRows(rows_.data(), row_weights_.data(), span.count, source_.width * channels_,
                   row_sums_.data());
-  if (channels_ == 3 && area < kSmallArea) {
+  if (channels_ == 3 && area < kMostBoxArea) {
     kernels.averageColumns(row_sums_.data(),
                            {columns_.data(), target_.width,
                             static_cast<std::uint32_t>(x_.source_units), static_cast<int>(area)},

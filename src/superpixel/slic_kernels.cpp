@@ -90,11 +90,12 @@ void sumRows(const std::uint8_t* const* rows, const std::uint32_t* weights, int 
   }
 }
 
-// The quotient of two floats, cut to an integer, is exact here: numerators stay below 2^24, and a
-// quotient below 256 that is no integer is at least 1 / area from the next one, more than its
-// rounding error of 2^-17.
-void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out) {
-  const auto divisor = static_cast<float>(columns.area);
+// The quotient of two numbers, cut to an integer, is exact here. With floats numerators stay below
+// 2^24, and a quotient below 256 that is no integer is at least 1 / area from the next one, more
+// than its rounding error of 2^-17; with doubles all that is below 2^31 is exact likewise.
+template <typename Real>
+void averageColumnsBy(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out) {
+  const auto divisor = static_cast<Real>(columns.area);
   for (int i = 0; i < columns.count; ++i) {
     const BoxSpan& span = columns.spans[i];
     const std::uint32_t* first = sums + static_cast<std::ptrdiff_t>(span.first) * 3;
@@ -105,8 +106,16 @@ void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::u
       const std::uint32_t sum = span.first_weight * first[c] + columns.whole_weight * between +
                                 span.last_weight * last[c] + columns.area / 2;
       *out++ = static_cast<std::uint8_t>(
-          static_cast<int>(static_cast<float>(static_cast<int>(sum)) / divisor));
+          static_cast<int>(static_cast<Real>(static_cast<int>(sum)) / divisor));
     }
+  }
+}
+
+void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out) {
+  if (columns.area < kFloatBoxArea) {
+    averageColumnsBy<float>(sums, columns, out);
+  } else {
+    averageColumnsBy<double>(sums, columns, out);
   }
 }
 

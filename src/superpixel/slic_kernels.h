@@ -48,13 +48,15 @@ struct BoxSpan {
   std::uint32_t first_weight, last_weight;  ///< last_weight is 0 if there is one cell only
 };
 
-/// Boxes of one row, for images of three channels whose boxes have a small area.
+/// Boxes of one row, for images of three channels.
 struct BoxColumns {
   const BoxSpan* spans;  ///< of each target pixel
   int count;
   std::uint32_t whole_weight;
-  int area;  ///< sum of the weights of a box, below 2^16
+  int area;  ///< sum of the weights of a box, below kMostBoxArea
 };
+constexpr int kFloatBoxArea = 1 << 16;  ///< below it the means are quotients of floats
+constexpr int kMostBoxArea = 1 << 23;   ///< sums of weighted bytes, and half, below 2^31
 
 constexpr int kBoxTaps = 4;
 /// Bytes of `taps` for each target pixel: the weights of a box's source columns, 0 beyond the last,

@@ -265,7 +265,25 @@ void sumRows(const std::uint8_t* const* rows, const std::uint32_t* weights, int 
   }
 }
 
-void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out) {
+/// Sums / area in single precision, cut to integers.
+struct FloatQuotient {
+  __m128 divisor;
+  __m128i operator()(__m128i sum) const {
+    return _mm_cvttps_epi32(_mm_div_ps(_mm_cvtepi32_ps(sum), divisor));
+  }
+};
+
+/// The same in double precision.
+struct DoubleQuotient {
+  __m256d divisor;
+  __m128i operator()(__m128i sum) const {
+    return _mm256_cvttpd_epi32(_mm256_div_pd(_mm256_cvtepi32_pd(sum), divisor));
+  }
+};
+
+template <typename Quotient>
+void averageColumnsBy(const Quotient& quotient, const std::uint32_t* sums,
+                      const BoxColumns& columns, std::uint8_t* out) {
   // A pixel's channels in the lower three lanes; what the fourth writes is written again by the
   // next pixel.
   const auto at = [sums](std::ptrdiff_t pixel) {
@@ -275,7 +293,6 @@ void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::u
     return _mm_mullo_epi32(value, _mm_set1_epi32(static_cast<int>(weight)));
   };
   const __m128i half = _mm_set1_epi32(columns.area / 2);
-  const __m128 divisor = _mm_set1_ps(static_cast<float>(columns.area));
   const __m128i low_bytes =
       _mm_setr_epi8(0, 4, 8, 12, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1);
   for (int i = 0; i < columns.count; ++i, out += 3) {
@@ -292,9 +309,18 @@ void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::u
       sum = _mm_add_epi32(sum, weighted(at(span.first), span.first_weight));
       sum = _mm_add_epi32(sum, weighted(at(span.first + span.count - 1), span.last_weight));
     }
-    const __m128i mean = _mm_cvttps_epi32(_mm_div_ps(_mm_cvtepi32_ps(sum), divisor));
-    const int bytes = _mm_cvtsi128_si32(_mm_shuffle_epi8(mean, low_bytes));
+    const int bytes = _mm_cvtsi128_si32(_mm_shuffle_epi8(quotient(sum), low_bytes));
     __builtin_memcpy(out, &bytes, sizeof(bytes));
+  }
+}
+
+void averageColumns(const std::uint32_t* sums, const BoxColumns& columns, std::uint8_t* out) {
+  if (columns.area < kFloatBoxArea) {
+    const FloatQuotient quotient{_mm_set1_ps(static_cast<float>(columns.area))};
+    averageColumnsBy(quotient, sums, columns, out);
+  } else {
+    const DoubleQuotient quotient{_mm256_set1_pd(static_cast<double>(columns.area))};
+    averageColumnsBy(quotient, sums, columns, out);
   }
 }
 

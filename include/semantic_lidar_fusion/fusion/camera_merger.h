@@ -27,14 +27,15 @@ struct CameraVotes {
 /// `cloud`: points and class_count are given, the other arrays are made here. `votes` are in order
 /// of camera name: sums run in that order, in double.
 ///
-/// A point with one vote keeps it as it is. `kProduct` and `kGeometricMean` are formed in log
-/// space; where the cameras
-/// contradict each other fully (every class has a zero from some camera) it falls back to the mean.
+/// A point with one vote keeps it as it is. `kProduct` and `kGeometricMean` are formed in log space
+/// where the product of two could underflow, and of more; where the cameras contradict each other
+/// fully (every class has a zero from some camera) they fall back to the mean.
 /// The label is the most likely class as published (float), the lowest id on ties; confidence is
 /// its probability, entropy H / ln(class_count) (0 for one class); `cameras` holds the bits of the
 /// cameras whose votes were used. Throws DataError if arrays of `votes` do not fit each other or
-/// the cloud. The points are shared out among the threads of `pool`, if there is one.
+/// the cloud. The points are shared out among the threads of `pool`, if there is one. Without
+/// `with_entropy` the entropy stays 1, for smoothing to fill.
 void mergeVotes(const std::vector<CameraVotes>& votes, OverlapRule rule, SemanticCloud* cloud,
-                ThreadPool* pool = nullptr);
+                ThreadPool* pool = nullptr, bool with_entropy = true);
 
 }  // namespace semantic_lidar_fusion

@@ -64,11 +64,11 @@ TEST(BoxReduction, IsTheRoundedMeanOfEachBox) {
   }
 }
 
-// Areas of boxes where rounding is tightest, and the ones around the limit of the fast division.
+// Areas of boxes where rounding is tightest, and the ones around the limits of the fast divisions.
 TEST(BoxReduction, MeansOfTwoLevelsRoundExactly) {
   for (const int type : {CV_8UC1, CV_8UC3}) {
     const int channels = CV_MAT_CN(type);
-    for (const int width : {255, 256, 4095, 65521, 65535, 65536, 70001}) {
+    for (const int width : {255, 256, 4095, 65521, 65535, 65536, 70001, 999983, 8388607, 8388608}) {
       cv::Mat image(1, width, type);
       BoxReduction reduction({width, 1}, {1, 1}, channels);
       for (const SlicKernels* kernels : usableKernels()) {
@@ -160,6 +160,8 @@ TEST(BoxReduction, WideKernelsGiveThePlainBytes) {
   // A camera's size to that of the map: boxes of whole columns and parts of rows.
   compare({1920, 31}, {640, 10});
   compare({480, 302}, {160, 101});
+  // Sizes without a common divisor: boxes of large areas.
+  compare({1226, 37}, {817, 25});
   // Every width of a box from 1 to 6 columns, in whole and broken ratios, odd widths, single rows.
   for (int width = 1; width <= 70; ++width) {
     for (const int target_width : {1, 3, 16, 23, 32, 64}) compare({width, 1}, {target_width, 1});
