@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <string>
 
 #include "semantic_lidar_fusion/common/error.h"
@@ -53,8 +54,9 @@ class Smoother {
     slots_.resize(n * kSmoothingLinks);
     weights_.resize(n * kSmoothingLinks + kSmoothingLanes);
     inverse_.resize(n);
-    rows_.resize(n * static_cast<std::size_t>(stride_));
-    next_.resize(rows_.size());
+    // Written before they are read: zeros would only take time.
+    rows_.reset(new float[n * static_cast<std::size_t>(stride_)]);
+    next_.reset(new float[n * static_cast<std::size_t>(stride_)]);
   }
 
   void smooth(int iterations) {
@@ -62,8 +64,8 @@ class Smoother {
     forShares([this](int begin, int end) { takeLogarithms(begin, end); });
     for (int k = 0; k < iterations; ++k) {
       forShares([this](int begin, int end) {
-        kernels_.average(rows_.data(), slots_.data(), weights_.data(), inverse_.data(), stride_,
-                         begin, end, next_.data());
+        kernels_.average(rows_.get(), slots_.data(), weights_.data(), inverse_.data(), stride_,
+                         begin, end, next_.get());
       });
       rows_.swap(next_);
     }
@@ -78,7 +80,7 @@ class Smoother {
             [&](int share) { work(share * kShare, std::min(count, (share + 1) * kShare)); });
   }
 
-  float* row(int slot) { return rows_.data() + static_cast<std::ptrdiff_t>(slot) * stride_; }
+  float* row(int slot) { return rows_.get() + static_cast<std::ptrdiff_t>(slot) * stride_; }
 
   /// Minus the exponent of w_ij.
   float distanceOf(std::uint32_t i, std::uint32_t j) const {
@@ -137,7 +139,9 @@ class Smoother {
       const std::uint32_t i = point_[slot];
       const float* p = row(slot);
       std::copy_n(p, classes_, probabilities(i));
-      const auto label = std::max_element(p, p + classes_) - p;  // the lowest of equal ones
+      const float* highest = p;
+      for (int c = 1; c < classes_; ++c) highest = p[c] > *highest ? p + c : highest;
+      const auto label = highest - p;  // the lowest of equal ones
       cloud_->label[i] = static_cast<std::uint8_t>(label);
       cloud_->confidence[i] = p[label];
       cloud_->entropy[i] = std::min(1.0f, std::max(0.0f, entropy[slot - begin] * per_log));
@@ -154,12 +158,12 @@ class Smoother {
   const SmoothingKernels& kernels_;
   int classes_, stride_;
   float per_distance_, per_intensity_;
-  std::vector<std::int32_t> slot_of_;  ///< by cloud index, kNoLink = not fused
-  std::vector<std::uint32_t> point_;   ///< by slot: cloud index
-  std::vector<std::int32_t> slots_;    ///< of the neighbours; its own where there is none
-  std::vector<float> weights_;         ///< of the neighbours; 0 where there is none
-  std::vector<float> inverse_;         ///< 1 / (1 + sum of weights)
-  std::vector<float> rows_, next_;     ///< A
+  std::vector<std::int32_t> slot_of_;     ///< by cloud index, kNoLink = not fused
+  std::vector<std::uint32_t> point_;      ///< by slot: cloud index
+  std::vector<std::int32_t> slots_;       ///< of the neighbours; its own where there is none
+  std::vector<float> weights_;            ///< of the neighbours; 0 where there is none
+  std::vector<float> inverse_;            ///< 1 / (1 + sum of weights)
+  std::unique_ptr<float[]> rows_, next_;  ///< A, `stride_` numbers a slot
 };
 
 }  // namespace
