@@ -67,7 +67,7 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     StampedStore<Image> images{kWaiting};
     StampedStore<sensor_msgs::ImageConstPtr> scores{kWaitingScores};
 
-    ros::Publisher share, share_view, superpixels, probabilities, overlay;
+    ros::Publisher share, share_view, superpixels, probabilities, confidence_view, overlay;
     ros::Subscriber image_subscriber, scores_subscriber;
   };
 
@@ -93,8 +93,10 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
         camera.share_view = output("share_view");
       }
       camera.superpixels = output("superpixels");
-      if (config.input != CameraInput::kProbabilities)
+      if (config.input != CameraInput::kProbabilities) {
         camera.probabilities = output("probabilities");
+        camera.confidence_view = output("confidence_view");
+      }
       if (config.input == CameraInput::kScores) camera.overlay = output("uncertainty_overlay");
     }
     if (cameras_.empty() && !only.empty()) {
@@ -160,7 +162,8 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     for (const auto& owned : cameras_) {
       Camera* camera = owned.get();
       const bool wants_semantics = isWanted(camera->share) || isWanted(camera->share_view) ||
-                                   isWanted(camera->probabilities) || isWanted(camera->overlay);
+                                   isWanted(camera->probabilities) ||
+                                   isWanted(camera->confidence_view) || isWanted(camera->overlay);
       const bool wants_image = wants_semantics || isWanted(camera->superpixels);
       update(wants_image, cameraTopic(camera->config, "image_selected"), camera,
              &SuperpixelUncertaintyNodelet::onImage, &camera->image_subscriber);
@@ -271,8 +274,14 @@ class SuperpixelUncertaintyNodelet : public FusionNodelet {
     segment(camera, **scores, &segmented);
     if (listened(camera->superpixels)) add(camera->superpixels, segmented.superpixels.ids);
     if (camera->config.input == CameraInput::kScores) add(camera->share, segmented.share);
-    if (transfersProbabilities(rig(), camera->config) || listened(camera->probabilities)) {
-      add(camera->probabilities, pipeline_->probabilities(segmented));
+    const bool published =
+        transfersProbabilities(rig(), camera->config) || listened(camera->probabilities);
+    if (published || listened(camera->confidence_view)) {
+      const cv::Mat probabilities = pipeline_->probabilities(segmented);
+      if (published) add(camera->probabilities, probabilities);
+      if (listened(camera->confidence_view)) {
+        add(camera->confidence_view, drawConfidence(probabilities));
+      }
     }
     if (listened(camera->share_view)) add(camera->share_view, drawShare(segmented.share));
     if (listened(camera->overlay)) {

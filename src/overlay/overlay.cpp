@@ -448,13 +448,34 @@ cv::Mat drawUncertainty(const cv::Mat& image, const cv::Mat& superpixel_ids, con
   return stack(canvas, scaleBar(panelWidth(canvas)));
 }
 
+namespace {
+
+/// A part of 1 as a grey level, 255 = 1; 0 where it is not in (0, 1].
+std::uint8_t greyOf(float part) {
+  return part > 0 && part <= 1 ? cv::saturate_cast<std::uint8_t>(255 * part) : std::uint8_t{0};
+}
+
+}  // namespace
+
 cv::Mat drawShare(const cv::Mat& share) {
   checkMap(share, CV_32FC1, "share");
-  cv::Mat view = cv::Mat::zeros(share.size(), CV_8UC1);
+  cv::Mat view(share.size(), CV_8UC1);
   for (int y = 0; y < share.rows; ++y) {
-    for (int x = 0; x < share.cols; ++x) {
-      const float s = share.at<float>(y, x);
-      if (s > 0 && s <= 1) view.at<std::uint8_t>(y, x) = cv::saturate_cast<std::uint8_t>(255 * s);
+    const float* in = share.ptr<float>(y);
+    std::transform(in, in + share.cols, view.ptr(y), greyOf);
+  }
+  return view;
+}
+
+cv::Mat drawConfidence(const cv::Mat& probabilities) {
+  const int classes = probabilities.channels();
+  checkMap(probabilities, CV_32FC(classes), "probabilities");
+  cv::Mat view(probabilities.size(), CV_8UC1);
+  for (int y = 0; y < probabilities.rows; ++y) {
+    const float* p = probabilities.ptr<float>(y);
+    std::uint8_t* out = view.ptr(y);
+    for (int x = 0; x < probabilities.cols; ++x, p += classes) {
+      out[x] = greyOf(*std::max_element(p, p + classes));
     }
   }
   return view;

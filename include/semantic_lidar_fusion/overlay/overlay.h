@@ -38,4 +38,8 @@ cv::Mat drawUncertainty(const cv::Mat& image, const cv::Mat& superpixel_ids, con
 /// not in (0, 1].
 cv::Mat drawShare(const cv::Mat& share);
 
+/// The largest class probability of each pixel of `probabilities` (CV_32FC<classes>) as CV_8UC1,
+/// 255 = sure; 0 where it is not in (0, 1]. Throws DataError.
+cv::Mat drawConfidence(const cv::Mat& probabilities);
+
 }  // namespace semantic_lidar_fusion

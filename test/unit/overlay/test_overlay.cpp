@@ -319,6 +319,19 @@ TEST(DrawShare, IsOfEightBits) {
   EXPECT_THROW(drawShare(expected), DataError);
 }
 
+TEST(DrawConfidence, IsTheLargestProbability) {
+  const float nan = std::numeric_limits<float>::quiet_NaN();
+  cv::Mat probabilities(1, 3, CV_32FC3);
+  probabilities.at<cv::Vec3f>(0, 0) = {0.0F, 1.0F, 0.0F};
+  probabilities.at<cv::Vec3f>(0, 1) = {0.25F, 0.25F, 0.5F};
+  probabilities.at<cv::Vec3f>(0, 2) = {nan, nan, nan};
+  const cv::Mat expected = (cv::Mat_<std::uint8_t>(1, 3) << 255, 128, 0);
+  const cv::Mat view = drawConfidence(probabilities);
+  ASSERT_EQ(view.type(), CV_8UC1);
+  EXPECT_EQ(cv::countNonZero(view != expected), 0) << view;
+  EXPECT_THROW(drawConfidence(expected), DataError);
+}
+
 TEST(DrawUncertainty, RefusesWhatDoesNotFit) {
   cv::Mat ids, share;
   quarters(&ids, &share);
