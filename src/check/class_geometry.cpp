@@ -14,6 +14,10 @@ constexpr double kGroundBand_m = 0.15, kHigh_m = 3.0, kNear_m = 15.0;
 constexpr std::uint64_t kFewest = 300;
 constexpr double kLeastGround = 0.35, kMostHigh = 0.25, kMostSky = 0.1;
 constexpr double kShiftGain = 0.15;
+/// Labels of one thing and its surroundings say nothing of the ground: so many classes must have
+/// this share of the points.
+constexpr int kFewestClasses = 3;
+constexpr double kClassShare = 0.01;
 
 const char* const kGroundWords[] = {
     "road",    "pavement", "sidewalk", "terrain", "grass",  "ground", "dirt",  "mud",       "lane",
@@ -49,6 +53,13 @@ double shareOf(const Histogram& histogram, const std::vector<bool>& classes, int
     }
   }
   return static_cast<double>(sum) / static_cast<double>(all);
+}
+
+int classesUsed(const Histogram& histogram) {
+  const double least = kClassShare * static_cast<double>(total(histogram));
+  return static_cast<int>(std::count_if(
+      histogram.begin(), histogram.end(),
+      [least](std::uint64_t count) { return count > 0 && static_cast<double>(count) >= least; }));
 }
 
 int commonest(const Histogram& histogram) {
@@ -129,7 +140,7 @@ ClassGeometry::Answer ClassGeometry::judge(const LabelSet& classes) const {
       classesNamed(classes, {std::begin(kGroundWords), std::end(kGroundWords)});
   const std::vector<bool> skies = classesNamed(classes, {"sky"});
   const bool knows_ground = std::find(grounds.begin(), grounds.end(), true) != grounds.end();
-  if (!knows_ground || total(on_ground_) < kFewest) return {};
+  if (!knows_ground || total(on_ground_) < kFewest || classesUsed(all_) < kFewestClasses) return {};
   const bool has_high = total(high_) >= kFewest;
   const double share = shareOf(on_ground_, grounds);
   const auto fit = [&](int by) {

@@ -2,6 +2,7 @@
 """check_rig.py and make_rig.py: the search on scenes of known truth, the ordinary mistakes on a
 simulated drive, proposals from bags, and what a user sees."""
 
+import dataclasses
 import json
 import os
 import re
@@ -21,6 +22,7 @@ from semantic_lidar_fusion.bags.bag_io import BagReader  # noqa: E402
 from semantic_lidar_fusion.errors import DataError  # noqa: E402
 from semantic_lidar_fusion.rigcheck import (  # noqa: E402
     alignment,
+    camera_checks,
     findings,
     motion_checks,
     propose,
@@ -104,6 +106,26 @@ def test_search_finds_turns_and_times_jointly(seed):
     assert abs(error[3]) < 0.004  # at 8 m/s and 15 m a pixel is 4.6 ms
     # Half of the boards' edges are hidden by others.
     assert found.best.lift > 0.3 and found.best.lift > 1.5 * found.now.lift
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_far_offset_is_told_though_the_best_place_is_flat(seed):
+    """0.2 s off on a drive along the optical axis, in which 20 ms hardly move the edges."""
+    views, matrix = boxes_scene(seed, (0.3, 0.0, -6.0), (0.0, 0.0, 0.0), 0.1, (0, 0, 0))
+    # What moved for 0.1 s at this speed moved for 0.2 s at half of it.
+    views = [dataclasses.replace(view, velocity=view.velocity / 2) for view in views]
+    found = alignment.fit(views, pinhole, matrix, moving=True)
+    assert abs(found.offset[alignment.TIME] - 0.2) < 0.01
+    assert found.contrast[alignment.TIME] <= alignment.MIN_CONTRAST[alignment.TIME]
+    assert found.observable[alignment.TIME]
+
+
+def test_edges_that_meet_far_better_aside_are_no_ok():
+    found = alignment_of((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    assert camera_checks._edges("front", found, "", explained=False).verdict == Verdict.OK
+    found = dataclasses.replace(found, now=dataclasses.replace(found.now, lift=0.15))
+    assert camera_checks._edges("front", found, "", explained=False).verdict == Verdict.SUSPECT
+    assert camera_checks._edges("front", found, "", explained=True).verdict == Verdict.OK
 
 
 @pytest.mark.parametrize("readout_s", [0.0, -0.03])

@@ -47,6 +47,9 @@ MAX_CHANCE = 0.5
 # Loss of lift, as a share, one probe away from the best place: less, and the axis is not observable.
 PROBE = np.array([np.radians(1.0), np.radians(1.0), np.radians(1.5), 0.02])
 MIN_CONTRAST = np.array([0.2, 0.2, 0.1, 0.15])
+# An offset farther than this many probes is observable whatever its contrast, if the rig's own value
+# loses this share of the lift: the place of the best may be flat, the rig's is refuted.
+FAR_PROBES, REFUTED = 2.0, 0.3
 # What the method itself leaves open on data of known truth, in deg and s.
 FLOOR = np.array([np.radians(0.1), np.radians(0.06), np.radians(0.15), 0.0007])
 
@@ -278,11 +281,13 @@ def fit(
     parts = [Stack(part) for part in (views[0::2], views[1::2]) if part]
     halves = [_refined(lift_of(part), x, free) for part in parts]
     spread = np.abs(halves[0] - halves[1])[:4] / 2 if len(halves) == 2 else np.full(4, np.inf)
-    contrast = np.zeros(4)
+    contrast, refuted = np.zeros(4), np.zeros(4, dtype=bool)
     middle, span = x[:4].copy(), np.zeros(4)
     for axis in free[:-1]:
         away = [lift(_moved(x, axis, sign * PROBE[axis])) for sign in (-1.0, 1.0)]
         contrast[axis] = (best - max(away)) / max(best, 1e-9)
+        far = abs(x[axis]) > FAR_PROBES * PROBE[axis]
+        refuted[axis] = far and lift(_moved(x, axis, -x[axis])) < (1.0 - REFUTED) * best
         good, span[axis] = _as_good(lift, x, axis, best)
         if axis == PITCH:  # the valley of pitch and height is long and flat
             middle[axis] = good
@@ -290,7 +295,7 @@ def fit(
     after = whole.score(project, T_camera_vehicle, x)
     enough = after.edges >= MIN_EDGES and best >= MIN_LIFT
     half_width = np.sqrt(FLOOR**2 + (1.5 * spread) ** 2 + span**2)
-    observable = (contrast >= MIN_CONTRAST) & enough & np.isfinite(half_width)
+    observable = ((contrast >= MIN_CONTRAST) | refuted) & enough & np.isfinite(half_width)
     return Alignment(middle, half_width, contrast, observable, now, after, float(x[HEIGHT]))
 
 

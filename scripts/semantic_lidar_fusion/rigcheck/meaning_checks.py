@@ -19,6 +19,9 @@ GROUND_WORDS = (
 )
 GROUND_BAND_M, HIGH_M, NEAR_M = 0.15, 3.0, 15.0
 MIN_POINTS = 150
+# Labels of one thing and its surroundings (a target, a person) say nothing of the ground: so many
+# classes must have this share of the points.
+MIN_CLASSES, MIN_CLASS_SHARE = 3, 0.01
 MIN_GROUND_SHARE, MAX_HIGH_SHARE, MAX_SKY_SHARE = 0.5, 0.25, 0.1
 FLIP_GAIN = 0.08
 SHIFT_GAIN = 0.15
@@ -83,6 +86,11 @@ def _one_camera(
         figure = "%d points on the ground" % len(on_ground)
         if not grounds:
             figure = "no class of the set is known as ground"
+        return [Finding(name, "classes", Verdict.NOT_OBSERVABLE, figure)]
+    counts = np.bincount(every)
+    used = int((counts >= MIN_CLASS_SHARE * len(every)).sum())
+    if used < MIN_CLASSES:
+        figure = "only %d of the classes have %.0f %% of the points" % (used, 100 * MIN_CLASS_SHARE)
         return [Finding(name, "classes", Verdict.NOT_OBSERVABLE, figure)]
     share = float(np.isin(on_ground, grounds).mean())
     high_share = float(np.isin(high, grounds).mean()) if len(high) >= MIN_POINTS else 0.0

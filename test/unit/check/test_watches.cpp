@@ -153,21 +153,26 @@ LabelSet classes() {
       "test");
 }
 
-/// A lidar 1.8 m above a road, with walls up to 8 m; labels by `label(is_ground)`.
+constexpr int kBuilding = 1, kRoad = 2, kTree = 3, kCar = 4;
+
+/// A lidar 1.8 m above a road, with walls up to 8 m, and some trees and cars; labels by
+/// `label(true class)`.
 template <typename Label>
 SemanticCloud street(const Label& label) {
   SemanticCloud cloud;
-  const auto add = [&](float x, float y, float z, bool ground) {
+  const auto add = [&](float x, float y, float z, int of) {
     cloud.points.x.push_back(x);
     cloud.points.y.push_back(y);
     cloud.points.z.push_back(z);
     cloud.points.status.push_back(0);
     cloud.cameras.push_back(1);
-    cloud.label.push_back(static_cast<std::uint8_t>(label(ground)));
+    cloud.label.push_back(static_cast<std::uint8_t>(label(of)));
   };
   for (int i = 0; i < 40; ++i) {
-    for (int k = 0; k < 40; ++k) add(0.5f * i - 10.0f, 0.25f * k - 5.0f, -1.8f, true);
-    for (int k = 1; k < 20; ++k) add(0.5f * i - 10.0f, 6.0f, 0.5f * k - 1.8f, false);
+    for (int k = 0; k < 40; ++k) add(0.5f * i - 10.0f, 0.25f * k - 5.0f, -1.8f, kRoad);
+    for (int k = 1; k < 20; ++k) add(0.5f * i - 10.0f, 6.0f, 0.5f * k - 1.8f, kBuilding);
+    add(0.5f * i - 10.0f, 4.0f, -0.8f, kCar);
+    add(0.5f * i - 10.0f, -4.0f, -0.8f, kTree);
   }
   return cloud;
 }
@@ -186,19 +191,26 @@ ClassGeometry::Answer judged(const Label& label) {
 
 TEST(ClassGeometry, NamesIdsThatDoNotFitTheGround) {
   using Verdict = ClassGeometry::Verdict;
-  EXPECT_EQ(judged([](bool ground) { return ground ? 2 : 1; }).verdict, Verdict::kFine);
-  EXPECT_EQ(judged([](bool ground) { return ground ? 3 : 2; }).verdict, Verdict::kIdsTooHigh);
-  EXPECT_EQ(judged([](bool ground) { return ground ? 1 : 0; }).verdict, Verdict::kIdsTooLow);
-  EXPECT_EQ(judged([](bool ground) { return ground ? 4 : 3; }).verdict, Verdict::kGroundIsOther);
-  EXPECT_EQ(judged([](bool) { return 2; }).verdict, Verdict::kGroundIsHigh);
+  EXPECT_EQ(judged([](int of) { return of; }).verdict, Verdict::kFine);
+  EXPECT_EQ(judged([](int of) { return of + 1; }).verdict, Verdict::kIdsTooHigh);
+  EXPECT_EQ(judged([](int of) { return of - 1; }).verdict, Verdict::kIdsTooLow);
+  EXPECT_EQ(judged([](int of) { return (of + 2) % 5; }).verdict, Verdict::kGroundIsOther);
+  EXPECT_EQ(judged([](int of) { return of == kBuilding ? kRoad : of; }).verdict,
+            Verdict::kGroundIsHigh);
   int n = 0;
-  const auto some_sky = judged([&](bool ground) { return ground ? 2 : (++n % 2 ? 0 : 1); });
+  const auto some_sky =
+      judged([&](int of) { return of == kBuilding ? (++n % 2 ? 0 : kBuilding) : of; });
   EXPECT_EQ(some_sky.verdict, Verdict::kSky);
   EXPECT_NE(some_sky.text.find("sky"), std::string::npos);
 }
 
+TEST(ClassGeometry, LabelsOfOneThingAndItsSurroundingsSayNothing) {
+  EXPECT_EQ(judged([](int of) { return of == kCar ? kCar : kBuilding; }).verdict,
+            ClassGeometry::Verdict::kTooFew);
+}
+
 TEST(ClassGeometry, SaysNothingWithoutGroundClassesOrPoints) {
-  const SemanticCloud cloud = street([](bool) { return 0; });
+  const SemanticCloud cloud = street([](int of) { return of; });
   ClassGeometry geometry;
   EXPECT_EQ(geometry.judge(classes()).verdict, ClassGeometry::Verdict::kTooFew);
   geometry.add(cloud, 1, Transform::Identity(), *groundPlane(cloud.points, Transform::Identity()));
@@ -210,7 +222,7 @@ TEST(ClassGeometry, SaysNothingWithoutGroundClassesOrPoints) {
 }
 
 TEST(ClassGeometry, FindsTheGroundAboveALidarOnItsHead) {
-  const SemanticCloud cloud = street([](bool) { return 2; });
+  const SemanticCloud cloud = street([](int) { return kRoad; });
   const Transform on_its_head(Eigen::AngleAxisd(kPi, Eigen::Vector3d::UnitX()));
   const auto ground = groundPlane(cloud.points, on_its_head);
   ASSERT_TRUE(ground);
