@@ -389,6 +389,9 @@ def _span(sample: Sample, span_s: float, turn: float) -> Finding:
     figure = "a scan spans %.4g ms and %.0f deg" % (1e3 * span_s, 360 * turn)
     if period:
         figure += ", scans come every %.0f ms" % (1e3 * period)
+    if span_s == 0 and not sample.corrects_motion():
+        figure += ": times are not used (motion.enabled: false)"
+        return Finding("lidar", "time unit", Verdict.OK, figure)
     if span_s == 0:
         cause = "no time per point: a whole scan is taken for one instant"
         cure = "set lidar.without_time: azimuth, or let the driver send a time field"

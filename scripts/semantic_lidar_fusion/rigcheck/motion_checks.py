@@ -128,7 +128,7 @@ def odometry_findings(sample: Sample) -> List[Finding]:
     """Coverage, pose against twist, and both against the lidar's own motion."""
     odometry = sample.odometry
     if not len(odometry):
-        if not sample.rig.get("motion", {}).get("enabled", True):
+        if not sample.corrects_motion():
             return [Finding("odometry", "poses", Verdict.OK, "not used (motion.enabled: false)")]
         figure = "no pose of %s in %s" % (sample.rig["vehicle_frame"], sample.rig["fixed_frame"])
         cure = "publish it on tf"

@@ -157,6 +157,10 @@ class Sample:
     def lidar_frame(self) -> str:
         return self.scans[0].frame_id if self.scans else ""
 
+    def corrects_motion(self) -> bool:
+        """Whether the rig uses odometry and the points' times."""
+        return bool(self.rig.get("motion", {}).get("enabled", True))
+
     def T_vehicle_lidar(self) -> Optional[np.ndarray]:
         return self._static(str(self.rig["vehicle_frame"]), self.lidar_frame)
 
