@@ -38,6 +38,9 @@ MAX_HEIGHT_M = 0.02
 # half-width, and of pitch, which is flat, their middle is reported.
 AS_GOOD = 0.03
 GRID = (33, 33, 17, 33)
+# Yaw and time of a camera that looks sideways nearly make up for each other: places of this many steps
+# of both together are tried as further starts.
+VALLEY_GRID = 17
 FAR_TIME_S = 0.3
 
 MIN_LIFT = 0.12  # below, edges and image do not belong together, whatever the offset
@@ -384,18 +387,40 @@ def _coarse(lift: Callable[[np.ndarray], float], free: Sequence[int]) -> np.ndar
         far = times[int(np.argmax(lifts))]
         if abs(far) > SEARCH[TIME]:
             starts.append(np.array([0.0, 0.0, 0.0, far]))
-    results = [_descend(lift, start, free) for start in starts]
-    return max(results, key=lift)
+    found = max((_descend(lift, start, free) for start in starts), key=lift)
+    return _across_valley(lift, found, free) if TIME in free else found
+
+
+def _across_valley(
+    lift: Callable[[np.ndarray], float], x: np.ndarray, free: Sequence[int]
+) -> np.ndarray:
+    """The better of `x` and what is found from the best of other pairs of yaw and time."""
+    best, start = -np.inf, x
+    for yaw in np.linspace(-1.0, 1.0, VALLEY_GRID) * SEARCH[YAW]:
+        for later in np.linspace(-1.0, 1.0, VALLEY_GRID) * SEARCH[TIME]:
+            far = abs(yaw - x[YAW]) > STEP[YAW] or abs(later - x[TIME]) > STEP[TIME]
+            y = x.copy()
+            y[[YAW, TIME]] = yaw, later
+            value = lift(y)
+            if far and value > best:
+                best, start = value, y
+    other = _descend(lift, start, free, turns=2, first_part=3)
+    return max((x, other), key=lift)
 
 
 def _descend(
-    lift: Callable[[np.ndarray], float], start: np.ndarray, free: Sequence[int]
+    lift: Callable[[np.ndarray], float],
+    start: np.ndarray,
+    free: Sequence[int],
+    turns: int = 3,
+    first_part: int = 1,
 ) -> np.ndarray:
+    """Axis by axis; the first of `turns` goes over SEARCH / `first_part`, the others over a third."""
     x, best = start.copy(), lift(start)
-    for turn in range(3):
+    for turn in range(turns):
         before = x.copy()
         for axis in free:
-            reach = SEARCH[axis] / (1 if turn == 0 else 3)
+            reach = SEARCH[axis] / (first_part if turn == 0 else 3)
             for value in x[axis] + np.linspace(-reach, reach, GRID[axis]):
                 y = x.copy()
                 y[axis] = value
