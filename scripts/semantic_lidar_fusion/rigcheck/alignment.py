@@ -34,13 +34,20 @@ STEP = np.array([np.radians(0.3), np.radians(0.3), np.radians(0.6), 0.006, 0.01]
 # the edges are. A target at 2 m cannot tell them apart, so that good calibrations are wrong in both:
 # the search lets the height go by this much, and reports the pitch.
 MAX_HEIGHT_M = 0.02
-# Offsets whose lift is within this share of the best are as good: half their span belongs to the
-# half-width, and of pitch, which is flat, their middle is reported.
-AS_GOOD = 0.03
+# Offsets whose lift is within this share of the best, or within what it scatters by chance, are as
+# good: half their span belongs to the half-width, and of pitch, which is flat, their middle is
+# reported. The values of single edges scatter by EDGE_SCATTER.
+AS_GOOD, EDGE_SCATTER = 0.03, 0.35
+# The stretch is walked in so many steps to a probe away; it goes on beyond so many steps of less.
+STRETCH_STEPS, STRETCH_GAP = 16, 3
 GRID = (33, 33, 17, 33)
 # Yaw and time of a camera that looks sideways nearly make up for each other: places of this many steps
 # of both together are tried as further starts.
 VALLEY_GRID = 17
+# Where edges hardly meet, there are hills everywhere: the one that the rig stands on, within this part
+# of the search, is believed unless another is higher by this factor.
+NEAR_PART, CLEARLY_HIGHER = 4, 1.15
+SAME_HILL = 1.5 * SEARCH / NEAR_PART
 FAR_TIME_S = 0.3
 
 MIN_LIFT = 0.12  # below, edges and image do not belong together, whatever the offset
@@ -284,6 +291,8 @@ def fit(
     parts = [Stack(part) for part in (views[0::2], views[1::2]) if part]
     halves = [_refined(lift_of(part), x, free) for part in parts]
     spread = np.abs(halves[0] - halves[1])[:4] / 2 if len(halves) == 2 else np.full(4, np.inf)
+    after = whole.score(project, T_camera_vehicle, x)
+    tolerance = max(AS_GOOD * best, EDGE_SCATTER / np.sqrt(max(after.edges, 1)))
     contrast, refuted = np.zeros(4), np.zeros(4, dtype=bool)
     middle, span = x[:4].copy(), np.zeros(4)
     for axis in free[:-1]:
@@ -291,11 +300,10 @@ def fit(
         contrast[axis] = (best - max(away)) / max(best, 1e-9)
         far = abs(x[axis]) > FAR_PROBES * PROBE[axis]
         refuted[axis] = far and lift(_moved(x, axis, -x[axis])) < (1.0 - REFUTED) * best
-        good, span[axis] = _as_good(lift, x, axis, best)
+        good, span[axis] = _as_good(lift, x, axis, best - tolerance)
         if axis == PITCH:  # the valley of pitch and height is long and flat
             middle[axis] = good
     now = whole.score(project, T_camera_vehicle)
-    after = whole.score(project, T_camera_vehicle, x)
     enough = after.edges >= MIN_EDGES and best >= MIN_LIFT
     half_width = np.sqrt(FLOOR**2 + (1.5 * spread) ** 2 + span**2)
     observable = ((contrast >= MIN_CONTRAST) | refuted) & enough & np.isfinite(half_width)
@@ -309,28 +317,32 @@ def _moved(x: np.ndarray, axis: int, by: float) -> np.ndarray:
 
 
 def _as_good(
-    lift: Callable[[np.ndarray], float], x: np.ndarray, axis: int, best: float
+    lift: Callable[[np.ndarray], float], x: np.ndarray, axis: int, least: float
 ) -> Tuple[float, float]:
     """The middle and half the length of the stretch around x on which the lift, with the best height
-    for each pitch, is as good as the best."""
-    heights = [float(x[HEIGHT])]
+    and roll for each pitch, is at least `least`."""
+    ways = [(0.0, float(x[HEIGHT]))]  # roll by, height
     if axis == PITCH:
-        heights = [float(h) for h in np.linspace(-MAX_HEIGHT_M, MAX_HEIGHT_M, 5)]
+        heights = np.linspace(-MAX_HEIGHT_M, MAX_HEIGHT_M, 5)
+        ways = [(by * STEP[ROLL], float(h)) for by in (0.0, -0.5, 0.5) for h in heights]
 
     def is_good(by: float) -> bool:
-        y = _moved(x, axis, by)
-        values = []
-        for height in heights:
+        for roll_by, height in ways:
+            y = _moved(_moved(x, axis, by), ROLL, roll_by)
             y[HEIGHT] = height
-            values.append(lift(y))
-        return max(values) >= (1.0 - AS_GOOD) * best
+            if lift(y) >= least:
+                return True
+        return False
 
     ends = []
     for sign in (-1.0, 1.0):
-        reach, step = 0.0, PROBE[axis] / 16
-        while reach < PROBE[axis] and is_good(sign * (reach + step)):
-            reach += step
-        ends.append(sign * reach)
+        last = 0
+        for k in range(1, STRETCH_STEPS + 1):
+            if k - last > STRETCH_GAP:
+                break
+            if is_good(sign * k * PROBE[axis] / STRETCH_STEPS):
+                last = k
+        ends.append(sign * last * PROBE[axis] / STRETCH_STEPS)
     return x[axis] + (ends[0] + ends[1]) / 2, (ends[1] - ends[0]) / 2
 
 
@@ -379,22 +391,23 @@ def readout(
 
 
 def _coarse(lift: Callable[[np.ndarray], float], free: Sequence[int]) -> np.ndarray:
-    """Axis by axis over a grid, until nothing moves; the time also far away."""
-    starts = [np.zeros(4)]
+    """The hill that the rig stands on, unless another one is clearly higher."""
+    near = _descend(lift, np.zeros(4), free, first_part=NEAR_PART)
+    found = _descend(lift, np.zeros(4), free)
     if TIME in free:
         times = np.linspace(-FAR_TIME_S, FAR_TIME_S, 61)
         lifts = [lift(np.array([0.0, 0.0, 0.0, t])) for t in times]
         far = times[int(np.argmax(lifts))]
         if abs(far) > SEARCH[TIME]:
-            starts.append(np.array([0.0, 0.0, 0.0, far]))
-    found = max((_descend(lift, start, free) for start in starts), key=lift)
-    return _across_valley(lift, found, free) if TIME in free else found
+            start = np.array([0.0, 0.0, 0.0, far])
+            found = max((found, _descend(lift, start, free)), key=lift)
+        found = max((found, _descend(lift, _other_pair(lift, found), free, 2, 3)), key=lift)
+    beside = bool((np.abs(found - near) <= SAME_HILL).all())
+    return found if lift(found) > (1.0 if beside else CLEARLY_HIGHER) * lift(near) else near
 
 
-def _across_valley(
-    lift: Callable[[np.ndarray], float], x: np.ndarray, free: Sequence[int]
-) -> np.ndarray:
-    """The better of `x` and what is found from the best of other pairs of yaw and time."""
+def _other_pair(lift: Callable[[np.ndarray], float], x: np.ndarray) -> np.ndarray:
+    """The best place of another yaw and time than those of `x`."""
     best, start = -np.inf, x
     for yaw in np.linspace(-1.0, 1.0, VALLEY_GRID) * SEARCH[YAW]:
         for later in np.linspace(-1.0, 1.0, VALLEY_GRID) * SEARCH[TIME]:
@@ -404,8 +417,7 @@ def _across_valley(
             value = lift(y)
             if far and value > best:
                 best, start = value, y
-    other = _descend(lift, start, free, turns=2, first_part=3)
-    return max((x, other), key=lift)
+    return start
 
 
 def _descend(
