@@ -13,7 +13,8 @@ constexpr std::size_t kFewestNear = 200;
 constexpr double kGroundBand_m = 0.15, kHigh_m = 3.0, kNear_m = 15.0;
 constexpr std::uint64_t kFewest = 300;
 constexpr double kLeastGround = 0.35, kMostHigh = 0.25, kMostSky = 0.1;
-constexpr double kShiftGain = 0.15;
+/// By how much shifted ids must fit better, and how well then; or by how much however well.
+constexpr double kShiftGain = 0.15, kShiftFit = 0.5, kShiftFarGain = 0.5;
 /// Labels of one thing and its surroundings say nothing of the ground: so many classes must have
 /// this share of the points.
 constexpr int kFewestClasses = 3;
@@ -149,7 +150,8 @@ ClassGeometry::Answer ClassGeometry::judge(const LabelSet& classes) const {
   };
   const std::string called = percent(share) + " of its points on the ground have a class of ground";
   const int by = fit(1) >= fit(-1) ? 1 : -1;
-  if (fit(by) > std::max(fit(0) + kShiftGain, 0.5)) {
+  const double gain = fit(by) - fit(0);
+  if (gain > kShiftFarGain || (gain > kShiftGain && fit(by) > kShiftFit)) {
     return {by > 0 ? Verdict::kIdsTooHigh : Verdict::kIdsTooLow,
             called + ", most are " + nameOf(commonest(on_ground_), classes) +
                 ": class ids are one too " + (by > 0 ? "high" : "low")};

@@ -22,9 +22,12 @@ MIN_POINTS = 150
 # Labels of one thing and its surroundings (a target, a person) say nothing of the ground: so many
 # classes must have this share of the points.
 MIN_CLASSES, MIN_CLASS_SHARE = 3, 0.01
-MIN_GROUND_SHARE, MAX_HIGH_SHARE, MAX_SKY_SHARE = 0.5, 0.25, 0.1
+# Verges and hedges lie on the ground too: between the two shares nothing can be said.
+WRONG_GROUND_SHARE, MIN_GROUND_SHARE = 0.25, 0.5
+MAX_HIGH_SHARE, MAX_SKY_SHARE = 0.25, 0.1
 FLIP_GAIN = 0.08
-SHIFT_GAIN = 0.15
+# By how much shifted ids must fit better, and how well then; or by how much however well.
+SHIFT_GAIN, SHIFT_FIT, SHIFT_FAR_GAIN = 0.15, 0.5, 0.5
 
 
 def _ids(labels: LabelSet, words: Sequence[str]) -> List[int]:
@@ -108,7 +111,9 @@ def _one_camera(
         )
         cure = "use the class set whose order is the network's (with or without background first)"
         return [Finding(name, "classes", Verdict.WRONG, figure, cause, cure)]
-    if share < MIN_GROUND_SHARE:
+    if WRONG_GROUND_SHARE <= share < MIN_GROUND_SHARE:
+        return [Finding(name, "classes", Verdict.NOT_OBSERVABLE, figure)]
+    if share < WRONG_GROUND_SHARE:
         cause = (
             "the ground is called %s: the score channels have another order than the class set"
             % _commonest(on_ground, labels)
@@ -154,7 +159,9 @@ def _shift(
 
     as_it_is = fit(0)
     best = max((1, -1), key=fit)
-    return best if fit(best) > max(as_it_is + SHIFT_GAIN, 0.5) else 0
+    gain = fit(best) - as_it_is
+    clear = gain > SHIFT_FAR_GAIN or (gain > SHIFT_GAIN and fit(best) > SHIFT_FIT)
+    return best if clear else 0
 
 
 def class_map(pixels: np.ndarray) -> np.ndarray:
