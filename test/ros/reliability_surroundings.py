@@ -21,6 +21,7 @@ from reliability_feed import Drive, Feed, small_cameras  # noqa: E402
 from sensor_msgs.msg import Image, PointCloud2  # noqa: E402
 
 MASTER_GONE_S = 20.0
+START_S = 120.0
 PERIOD_S = 0.1
 
 
@@ -68,7 +69,10 @@ def feed(bag, seconds):
 
     thread = threading.Thread(target=publish)
     thread.start()
+    deadline = time.monotonic() + START_S
     while len(clouds) < 5:
+        if time.monotonic() > deadline:
+            os._exit(1)  # the publishing thread goes on
         time.sleep(0.05)
     print("ready", flush=True)
     sys.stdin.readline()
@@ -181,6 +185,8 @@ class Surroundings(Feed):
                 "bond:=false",
                 "threads:=2",
             ]
+            if os.environ.get("SLF_LAUNCH_PREFIX"):
+                chain.append("launch_prefix:=" + os.environ["SLF_LAUNCH_PREFIX"])
             vehicle = [sys.executable, os.path.abspath(__file__), "--feed", made.bag]
             pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, universal_newlines=True)
             with process(["rosmaster", "--core", "-p", str(port)], env=environment) as master:
