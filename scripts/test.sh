@@ -89,6 +89,7 @@ esac
 # Instrumented code is slower: so is what it is fed.
 if [ -n "$sanitize" ]; then
   export SLF_SOAK_RATE=${SLF_SOAK_RATE:-0.05} SLF_SOAK_MINUTES=${SLF_SOAK_MINUTES:-1.6}
+  export SLF_REPLAY_RATE=${SLF_REPLAY_RATE:-0.05}
 fi
 
 # Both names of the interpreter: ament, which newer pluginlib pulls in, reads only the second.

@@ -44,8 +44,9 @@ GRID = (33, 33, 17, 33)
 # Yaw and time of a camera that looks sideways nearly make up for each other: places of this many steps
 # of both together are tried as further starts.
 VALLEY_GRID = 17
-# Where edges hardly meet, there are hills everywhere: the one that the rig stands on, within this part
-# of the search, is believed unless another is higher by this factor.
+# Where edges hardly meet, there are hills everywhere: the one that the rig stands on, where a search
+# ends that begins with this part of its width, is believed unless another is higher by this factor.
+# Within SAME_HILL the higher place is.
 NEAR_PART, CLEARLY_HIGHER = 4, 1.15
 SAME_HILL = 1.5 * SEARCH / NEAR_PART
 FAR_TIME_S = 0.3
