@@ -135,3 +135,31 @@ def test_kitti_drive_with_a_network(optional_data, run_command, tmp_path):
     assert abs(np.median(height[road]) + 1.73) < 0.15
     assert np.median(height[vehicle]) > np.median(height[road]) + 0.5
     assert np.percentile(height[road], 90) < -1.3
+
+
+@pytest.mark.parametrize(
+    "dataset, path, options",
+    [
+        ("kitti", "data/kitti_drive", ()),
+        ("rellis", "data/rellis3d_000104", ("--scores", "onehot")),
+        ("acfr_calibration", "data/acfr_a0_vlp16", ("--scores", "onehot")),
+    ],
+)
+def test_check_rig_finds_nothing_wrong(
+    dataset, path, options, optional_data, run_command, tmp_path
+):
+    """Their calibrations are right: a false alarm costs trust."""
+    folder = optional_data(path)
+    bag = tmp_path / "drive.bag"
+    code, _, err = run_command("import_dataset.py", dataset, folder, bag, *options)
+    assert code in (0, None), err
+    code, out, _ = run_command(
+        "check_rig.py", bag, "--rig", tmp_path / "drive.yaml", "--out", tmp_path / "check"
+    )
+    assert code == 0, out
+    findings = json.loads((tmp_path / "check" / "findings.json").read_text())
+    assert {f["verdict"] for f in findings} <= {"ok", "not observable"}, out
+    camera = {f["check"]: f for f in findings if f["sensor"] not in ("bag", "lidar", "odometry")}
+    assert camera["axes"]["verdict"] == "ok"
+    if dataset != "rellis":  # one scan has too few edges
+        assert camera["yaw"]["verdict"] == "ok" and camera["time"]["verdict"] == "not observable"
