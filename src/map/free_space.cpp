@@ -13,7 +13,7 @@ namespace semantic_lidar_fusion {
 namespace {
 
 constexpr int kBits = FreeBrick::kBits;
-constexpr int kWithin = (1 << kBits) - 1;
+constexpr int kWide = 1 << kBits, kWithin = kWide - 1;
 constexpr std::size_t kFirstSlots = 1024;
 // A ray crosses a voxel if it runs through it for this part of an edge at least: one that cuts a
 // corner says little about what is there.
@@ -74,8 +74,8 @@ VoxelKey movedVoxel(const VoxelKey& ours, const MovedVoxels& theirs_ours) {
 }
 
 VoxelKey voxelOf(const FreeBrick& brick, int word, int bit) {
-  return {(brick.x << kBits) + (bit & kWithin), (brick.y << kBits) + (bit >> kBits),
-          (brick.z << kBits) + word};
+  return {brick.x * kWide + (bit & kWithin), brick.y * kWide + (bit >> kBits),
+          brick.z * kWide + word};
 }
 
 }  // namespace
@@ -287,8 +287,8 @@ std::vector<FreeBrick> FreeSpace::bricks(bool sorted) const {
   }
   if (sorted) {
     const auto key = [](const FreeBrick& b) {
-      return std::make_tuple(VoxelMap::tileOf(b.x << kBits), VoxelMap::tileOf(b.y << kBits), b.x,
-                             b.y, b.z);
+      return std::make_tuple(VoxelMap::tileOf(b.x * kWide), VoxelMap::tileOf(b.y * kWide), b.x, b.y,
+                             b.z);
     };
     std::sort(result.begin(), result.end(),
               [&](const FreeBrick& a, const FreeBrick& b) { return key(a) < key(b); });

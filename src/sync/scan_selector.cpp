@@ -2,7 +2,9 @@
 #include "semantic_lidar_fusion/sync/scan_selector.h"
 
 #include <algorithm>
+#include <cstdint>
 #include <iterator>
+#include <limits>
 #include <tuple>
 #include <utility>
 
@@ -18,7 +20,13 @@ constexpr std::size_t kMaxImages = 16384;
 constexpr std::size_t kLeastKnownScans = 64;
 constexpr std::size_t kMaxSettled = 8;
 
-StampNs distance(StampNs a, StampNs b) { return a < b ? b - a : a - b; }
+/// |a - b|, or the largest number where that is beyond it.
+StampNs distance(StampNs a, StampNs b) {
+  const auto difference =
+      static_cast<std::uint64_t>(std::max(a, b)) - static_cast<std::uint64_t>(std::min(a, b));
+  constexpr StampNs kLargest = std::numeric_limits<StampNs>::max();
+  return static_cast<StampNs>(std::min(difference, static_cast<std::uint64_t>(kLargest)));
+}
 
 /// The time closest to `target_ns`; of two the earlier.
 std::optional<StampNs> closest(const std::set<StampNs>& times, StampNs target_ns) {
@@ -27,7 +35,8 @@ std::optional<StampNs> closest(const std::set<StampNs>& times, StampNs target_ns
     return after == times.end() ? std::nullopt : std::optional<StampNs>(*after);
   }
   const StampNs before_ns = *std::prev(after);
-  if (after == times.end() || target_ns - before_ns <= *after - target_ns) return before_ns;
+  if (after == times.end() || distance(target_ns, before_ns) <= distance(*after, target_ns))
+    return before_ns;
   return *after;
 }
 
