@@ -115,8 +115,8 @@ struct SelectorCounters {
 class ScanSelector {
  public:
   static constexpr StampNs kLeastHistoryNs = kNsPerSecond;
-  /// Largest magnitude of a stamp; ROS stamps reach 4.3e18.
-  static constexpr StampNs kMaxStampNs = StampNs{1} << 62;
+  /// Largest magnitude of a stamp, so that differences fit; ROS stamps reach 4.3e18.
+  static constexpr StampNs kMaxStampNs = (StampNs{1} << 62) - 1;
 
   /// Throws ConfigError.
   explicit ScanSelector(SelectorConfig config);
