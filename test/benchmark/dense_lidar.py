@@ -27,6 +27,7 @@ SOURCE_DIR = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__f
 sys.path.insert(0, os.path.join(SOURCE_DIR, "test", "python"))
 
 from bag_factory import Camera, Drive, rig_text, write_bag  # noqa: E402
+from load_live_map import processor_s  # noqa: E402
 
 LIMITS = "lidar.max_range_m=80"
 
@@ -89,19 +90,14 @@ def offline(options, bag, rig, out):
 
 def manager_figures(pid):
     """CPU time (s) so far and largest memory (MB) of a process."""
-    with open("/proc/%d/stat" % pid) as file:
-        fields = file.read().rsplit(") ", 1)[1].split()
     with open("/proc/%d/status" % pid) as file:
         peak = next(line for line in file if line.startswith("VmHWM"))
-    seconds = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-    return seconds, int(peak.split()[1]) / 1024
+    return processor_s(pid), int(peak.split()[1]) / 1024
 
 
 def live(options, bag, rig):
-    environment = dict(
-        os.environ, ROS_MASTER_URI="http://127.0.0.1:%d" % options.port, ROS_IP="127.0.0.1"
-    )
-    os.environ.update(environment)
+    os.environ["ROS_MASTER_URI"] = "http://127.0.0.1:%d" % options.port
+    os.environ["ROS_IP"] = "127.0.0.1"
     command = ["roslaunch", "-p", str(options.port), "semantic_lidar_fusion", "replay.launch"]
     command += ["bag:=" + bag, "rig:=" + rig, "exit:=true", "overrides:=" + LIMITS]
     launch = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)

@@ -91,15 +91,19 @@ def _stop(process, timeout=20.0):
             raise AssertionError("%s does not end" % process.args)
 
 
-@contextlib.contextmanager
-def launched(name, **arguments):
-    """A launch file of the package as long as the block runs; a sanitizer reaches its manager."""
+def launch_command(name, **arguments):
+    """The command that starts a launch file of the package; a sanitizer reaches its manager."""
     # The map's node is Python without instrumented code.
     if os.environ.get("SLF_LAUNCH_PREFIX") and name != "semantic_map.launch":
         arguments.setdefault("launch_prefix", os.environ["SLF_LAUNCH_PREFIX"])
     command = ["roslaunch", "--skip-log-check", os.path.join(SOURCE_DIR, "launch", name)]
-    command += ["%s:=%s" % item for item in arguments.items()]
-    process = subprocess.Popen(command)
+    return command + ["%s:=%s" % item for item in arguments.items()]
+
+
+@contextlib.contextmanager
+def launched(name, **arguments):
+    """A launch file of the package as long as the block runs."""
+    process = subprocess.Popen(launch_command(name, **arguments))
     try:
         yield process
     finally:

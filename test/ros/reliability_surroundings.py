@@ -177,16 +177,7 @@ class Surroundings(Feed):
         environment = dict(os.environ, ROS_MASTER_URI="http://127.0.0.1:%d" % port)
         with live.folder() as path:
             made = live.Made(path, self.drive)
-            chain = [
-                "roslaunch",
-                "--skip-log-check",
-                os.path.join(live.SOURCE_DIR, "launch", "fusion.launch"),
-                "rig:=" + made.rig,
-                "bond:=false",
-                "threads:=2",
-            ]
-            if os.environ.get("SLF_LAUNCH_PREFIX"):
-                chain.append("launch_prefix:=" + os.environ["SLF_LAUNCH_PREFIX"])
+            chain = live.launch_command("fusion.launch", rig=made.rig, bond="false", threads=2)
             vehicle = [sys.executable, os.path.abspath(__file__), "--feed", made.bag]
             pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, universal_newlines=True)
             with process(["rosmaster", "--core", "-p", str(port)], env=environment) as master:

@@ -11,7 +11,7 @@ from semantic_lidar_fusion.bags.poses import invert
 from semantic_lidar_fusion.cameras import Camera
 from semantic_lidar_fusion.rigcheck import alignment, scenes, stated
 from semantic_lidar_fusion.rigcheck.alignment import PITCH, ROLL, TIME, YAW, Alignment, Score, View
-from semantic_lidar_fusion.rigcheck.findings import Finding, Verdict, judged
+from semantic_lidar_fusion.rigcheck.findings import Finding, Verdict, judged, worst
 from semantic_lidar_fusion.rigcheck.sample import CameraSample, Sample
 
 # Offsets from which on a rig is suspect, and wrong: deg and s.
@@ -379,14 +379,11 @@ def _one_camera(sample: Sample, one: Aligned, time_is_common: bool) -> List[Find
             )
         )
     result.append(_time(one, time_is_common))
-    result.insert(0, _edges(name, found, figure, explained=time_is_common or bool(_doubts(result))))
+    explained = time_is_common or worst(result) >= Verdict.SUSPECT
+    result.insert(0, _edges(name, found, figure, explained=explained))
     result += _readout(one)
     result += stated.findings(name, one.camera.config, sample.rig, found)
     return result
-
-
-def _doubts(findings: List[Finding]) -> List[Finding]:
-    return [one for one in findings if one.verdict in (Verdict.SUSPECT, Verdict.WRONG)]
 
 
 def _edges(name: str, found: Alignment, figure: str, explained: bool) -> Finding:
